@@ -191,6 +191,7 @@ def measure_problem(
             results.skipped.append(Skipped(peer.name, reason, problem.name))
             continue
         try:
+            peer.check(problem)
             build, _, runner = timing.once(lambda peer=peer: peer.prepare(problem))
         except NotApplicableError as error:
             say(f"  {peer.name:28s} skipped: {error}")

@@ -6,6 +6,7 @@ One-degree problems: the reduced equation in extended precision, extrapolated mi
 16, with two step sizes.  Others: the index-1 equations from Pinocchio's kinematics by a dense KKT
 solve, Gauss collocation of order 12 with a projection after every step and two step sizes, and
 SciPy's DOP853 near round-off without one; their largest difference is the accuracy that is stored.
+Stiff problems: the reduced equations by SciPy's Radau with two tolerances.
 """
 
 from __future__ import annotations
@@ -24,9 +25,12 @@ from benchmarks.work_precision.references import (
     write,
 )
 from benchmarks.work_precision.trees import Equations
+from tests.support.stiff import by_radau
 
 SUBSTEPS = (10, 12)
 """Steps from one sample to the next, of the two runs."""
+RTOLS = (1e-12, 1e-11)
+"""Tolerances of the two runs of a stiff problem."""
 
 
 def reduced(problem: Problem) -> Reference:
@@ -38,6 +42,20 @@ def reduced(problem: Problem) -> Reference:
     scipy = by_scipy(model.field, np.array(model.start), problem.times)
     print(f"  SciPy near round-off differs by {np.abs(scipy - reference.observed).max():.1e}")
     return reference
+
+
+def stiff(problem: Problem) -> Reference:
+    """From the reduced equations of a stiff problem."""
+    model = problem.reduced
+    if model is None:
+        raise ValueError(f"{problem.name} has no reduced model")
+    start = np.array(model.start)
+    fine, coarse = (by_radau(model.field, start, problem.times, rtol) for rtol in RTOLS)
+    difference = np.abs(fine - coarse)
+    difference[:, problem.rates :] /= problem.rate_unit
+    return Reference(
+        fine, float(difference.max()), "reduced equations, SciPy's Radau with two tolerances"
+    )
 
 
 def index_one(problem: Problem) -> Reference:
@@ -105,6 +123,8 @@ def main() -> None:
         problem = PROBLEMS[name]()
         if name == "squeezing_mechanism":
             reference = squeezing(problem)
+        elif problem.stiff:
+            reference = stiff(problem)
         else:
             reference = index_one(problem) if problem.reduced is None else reduced(problem)
         path = write(name, reference)

@@ -31,6 +31,9 @@ STYLES = {
     "exudyn": ("#CC79A7", "*", "--", 1.2),
     "sundials_ida": ("#56B4E9", "<", "-.", 1.2),
     "scipy_dae_radau": ("#56B4E9", ">", ":", 1.2),
+    "reduced_radau": ("#000000", "d", "-.", 1.2),
+    "reduced_cvode": ("#D55E00", "h", "-.", 1.2),
+    "reduced_ida": ("#E69F00", "p", ":", 1.2),
 }
 OTHER = ("#777777", ".", "-", 1.0)
 SHOWN_ERRORS = (1e-13, 10.0)

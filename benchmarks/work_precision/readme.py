@@ -17,7 +17,7 @@ from benchmarks.work_precision import plots, records
 from benchmarks.work_precision.counting import LEVELS
 from benchmarks.work_precision.records import FLOOR, OURS, Results
 from benchmarks.work_precision.tables import (
-    DEFAULT_VARIANT,
+    DEFAULT_VARIANTS,
     Best,
     best,
     markdown,
@@ -61,7 +61,7 @@ def table(results: Results, problems: Sequence[str] | None = None) -> str:
     rows = []
     for problem in problems or list(results.problems):
         facts = results.problems[problem]
-        ours = [best(results, problem, [OURS], level, DEFAULT_VARIANT) for level in LEVELS]
+        ours = [best(results, problem, [OURS], level, DEFAULT_VARIANTS) for level in LEVELS]
         peers = [best(results, problem, simulators(results), level) for level in LEVELS]
         floor = [best(results, problem, [FLOOR], level) for level in LEVELS]
         names = dict.fromkeys(results.peers[entry.peer] for entry in peers if entry)

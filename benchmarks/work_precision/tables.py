@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,9 @@ from typing import Any
 from benchmarks.work_precision.counting import LEVELS, Point, cheapest
 from benchmarks.work_precision.records import FLOOR, OURS, Results
 
-DEFAULT_VARIANT = "dop853, auto"
-"""What somebody gets who sets nothing but the tolerance."""
+DEFAULT_VARIANTS = ("dop853, auto", "auto, auto")
+"""What somebody gets who sets nothing but the tolerance: the first, or the second where the problem
+is stiff."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +39,17 @@ def sweeps(results: Results, problem: str, peer: str) -> dict[str, list[Point]]:
 
 
 def best(
-    results: Results, problem: str, peers: Iterable[str], level: float, variant: str | None = None
+    results: Results,
+    problem: str,
+    peers: Iterable[str],
+    level: float,
+    variants: Collection[str] | None = None,
 ) -> Best | None:
-    """The cheapest counting setting over ``peers`` and their variants, or one of these."""
+    """The cheapest counting setting over ``peers`` and their variants, or some of these."""
     found: list[Best] = []
     for peer in peers:
         for name, sweep in sweeps(results, problem, peer).items():
-            if variant is not None and name != variant:
+            if variants is not None and name not in variants:
                 continue
             point = cheapest(sweep, level)
             if point is not None:
@@ -66,7 +71,7 @@ def ratio_rows(results: Results, level: float) -> list[dict[str, Any]]:
     """
     out = []
     for problem in results.problems:
-        ours = best(results, problem, [OURS], level, DEFAULT_VARIANT)
+        ours = best(results, problem, [OURS], level, DEFAULT_VARIANTS)
         peer = best(results, problem, simulators(results), level)
         floor = best(results, problem, [FLOOR], level)
         out.append(

@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.analysis.time_constants import stiff_elements
 from srm_mbs.dynamics.constraints.rows import closure_errors
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import angle_coordinates, is_angle, row_angles
@@ -42,6 +43,8 @@ MAX_LISTED = 8
 """Longest list of numbers that is given in full; of longer ones the ends."""
 BUSHING_ANGULAR = [False, False, False, True, True, True]
 """Which of the six numbers of a bushing belong to angles."""
+MAX_STIFF = 5
+"""Joints and force elements that are listed as stiff."""
 BACKENDS = {"kernel": "the compiled kernel", "python": "the Python reference"}
 
 
@@ -240,6 +243,16 @@ def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
                     text = getattr(value, "__name__", "of the user")
                 values.append(f"{key.name} {text} {units[0]}".rstrip())
         yield force.name, force.type, ", ".join(places), ", ".join(values)
+
+
+def stiff_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str]]:
+    """(joint or force element, coefficient, time constant) of the MAX_STIFF stiffest ones, and how
+    many more there are."""
+    found = stiff_elements(mechanism)
+    for one in found[:MAX_STIFF]:
+        yield one.element, one.coefficient, f"{one.seconds:.2g} s"
+    if len(found) > MAX_STIFF:
+        yield f"and {len(found) - MAX_STIFF} more", "", f"up to {found[-1].seconds:.2g} s"
 
 
 def drive_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:

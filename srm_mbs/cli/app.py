@@ -109,7 +109,7 @@ def simulate(
         str | None,
         option(
             "NAME",
-            "Runge-Kutta scheme of the method.",
+            "Runge-Kutta scheme of the method; auto is dop853, and rodas5p where forces are stiff.",
             show_default="the method's: auto with psrm, tvd32 with srm",
         ),
     ] = None,
@@ -267,7 +267,7 @@ def convert(
 @app.command()
 @reported
 def info(model: Model, allow_outside: AllowOutside = False, keyframe: Keyframe = None) -> None:
-    """Describe a mechanism: joints, loops, forces, the start.
+    """Describe a mechanism: joints, loops, forces, the start, what is stiff.
 
     With its degrees of freedom, the rank of its closure rows, and the rows that are redundant.  Of
     a saved run (.npz) first a summary, with the residuals of the singular configurations it met.
@@ -280,6 +280,7 @@ def info(model: Model, allow_outside: AllowOutside = False, keyframe: Keyframe =
         loop_rows,
         mechanism_rows,
         run_rows,
+        stiff_rows,
     )
 
     if Path(model).suffix == ".npz":
@@ -295,6 +296,7 @@ def info(model: Model, allow_outside: AllowOutside = False, keyframe: Keyframe =
         (("loop", "type", "a", "b", "gap at the start"), loop_rows(mechanism)),
         (("force", "type", "acts on", "values"), force_rows(mechanism)),
         (("drive", "law", "moves", "values"), drive_rows(mechanism)),
+        (("stiff", "coefficient", "time constant"), stiff_rows(mechanism)),
     ):
         if listed := list(rows):
             echo("")

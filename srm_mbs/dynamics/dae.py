@@ -458,6 +458,9 @@ class DaeSystem:
     def apply_laws(self, values: FloatArray | None) -> None:
         """Nothing: a DAE has no forces."""
 
+    def derivatives(self, state: FloatArray, accelerations: FloatArray) -> None:
+        """None: its functions are known at single points only."""
+
     def position_norm(self, delta: FloatArray) -> float:
         """max |dx|; see :class:`~srm_mbs.dynamics.system.System`."""
         return float(np.abs(delta).max())

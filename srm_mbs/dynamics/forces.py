@@ -23,7 +23,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from math import copysign, inf, pi, sqrt
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -54,6 +54,26 @@ from srm_mbs.model.laws import Law
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 
+class Coefficient(NamedTuple):
+    """A coefficient c of an element, and the direction n of generalised forces in which it acts
+    with -c n^T v or -c n^T dq.
+
+    Attributes
+    ----------
+    kind
+        "damping" or "stiffness".
+    value
+        c, N s/m or N/m; N m s/rad or N m/rad if ``angular``.
+    direction : (nv,)
+        n.
+    """
+
+    kind: str
+    value: float
+    direction: FloatArray
+    angular: bool
+
+
 class Evaluator(ABC):
     """One element, resolved against a model.  ``data`` holds placements, velocities and J."""
 
@@ -64,6 +84,10 @@ class Evaluator(ABC):
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         """Its potential energy (J), if it has one; ``data`` need hold the placements only."""
         return 0.0
+
+    def coefficients(self, data: pin.Data) -> list[Coefficient]:
+        """Its coefficients that are not zero, if it damps or stores energy."""
+        return []
 
     @abstractmethod
     def constants(self) -> dict[str, Any] | None:
@@ -215,6 +239,19 @@ class SpringDamperEvaluator(LawEvaluator):
             force -= self.damping * along
         return force, at_a, apart / (length or 1.0)
 
+    def coefficients(self, data: pin.Data) -> list[Coefficient]:
+        _, at_a, line = self._force(data)
+        directions = []
+        for axis in [line] if self.rest_length else np.eye(3):
+            directions.append(np.zeros(len(self.support)))
+            add_wrench(directions[-1], data, self.support, axis, np.zeros(3), at_a)
+        return [
+            Coefficient(kind, value, direction, angular=False)
+            for kind, value in (("damping", self.damping), ("stiffness", self.stiffness))
+            for direction in directions
+            if value
+        ]
+
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         apart = self.a.placement(data).translation - self.b.placement(data).translation
         return 0.5 * self.stiffness * (sqrt(apart @ apart) - self.rest_length) ** 2
@@ -316,6 +353,17 @@ class BushingEvaluator(LawEvaluator):
         both = np.zeros(6)
         both[self._own] = values
         self._act(tau, data, both[:3], both[3:], self._forces(data, step)[2])
+
+    def coefficients(self, data: pin.Data) -> list[Coefficient]:
+        found = []
+        for i in self._own.tolist():
+            direction = np.zeros(len(self.support))
+            unit = np.eye(6)[i]
+            self._act(direction, data, unit[:3], unit[3:], self._forces(data, None)[2])
+            for kind, values in (("damping", self.damping), ("stiffness", self.stiffness)):
+                if values[i]:
+                    found.append(Coefficient(kind, float(values[i]), direction, angular=i > 2))
+        return found
 
     def _act(
         self,
@@ -453,6 +501,20 @@ class JointTorqueEvaluator(Evaluator):
         return {"kind": 1, "in_v": self.own.start} | self.torque.constants()
 
 
+def _of_coordinate(
+    element: TorsionSpringEvaluator | LimitSpringEvaluator, data: pin.Data
+) -> list[Coefficient]:
+    """The coefficients of an element on one coordinate."""
+    direction = np.zeros(data.M.shape[0])
+    direction[element.in_v] = 1.0
+    angular = bool(np.abs(world_jacobian(data)[3:, element.in_v]).max() > 0.0)
+    return [
+        Coefficient(kind, value, direction, angular)
+        for kind, value in (("damping", element.damping), ("stiffness", element.stiffness))
+        if value
+    ]
+
+
 class TorsionSpringEvaluator(Evaluator):
     """A :class:`~srm_mbs.model.forces.TorsionSpring`, resolved against a model."""
 
@@ -468,6 +530,9 @@ class TorsionSpringEvaluator(Evaluator):
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         return 0.5 * self.stiffness * float(q[self.in_q] - self.rest_angle) ** 2
+
+    def coefficients(self, data: pin.Data) -> list[Coefficient]:
+        return _of_coordinate(self, data)
 
     def constants(self) -> dict[str, Any]:
         return {
@@ -507,6 +572,9 @@ class LimitSpringEvaluator(Evaluator):
         x = min(beyond / depth, 1.0)
         inside = depth**2 * x**5 * (2.0 + x * (6.0 / 7.0 * x - 2.5))
         return self.stiffness * (inside + 0.5 * max(beyond**2 - depth**2, 0.0))
+
+    def coefficients(self, data: pin.Data) -> list[Coefficient]:
+        return _of_coordinate(self, data)
 
     def constants(self) -> dict[str, Any]:
         return {
@@ -548,6 +616,9 @@ _EVALUATORS = {
     LimitSpring: LimitSpringEvaluator,
     UserForce: _UserForceEvaluator,
 }
+
+
+_LAWFUL = LawEvaluator | TorsionSpringEvaluator | LimitSpringEvaluator
 
 
 @per_model
@@ -659,6 +730,10 @@ class ForceKinematics:
                 element.add(tau, data, q, v, t)
         return tau
 
+    def coefficients(self, data: pin.Data) -> list[list[Coefficient]]:
+        """Those of each element; ``data`` as for :meth:`generalised`."""
+        return [element.coefficients(data) for element in self._elements]
+
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         """Potential energy (J) of springs and bushings; ``data`` must hold the placements."""
         return sum(element.energy(data, q) for element in self._elements)
@@ -698,6 +773,39 @@ class ForceKinematics:
                 element.add(along, data, q, v, 0.0)
         between = [e for e in self._elements if isinstance(e, LawEvaluator)]
         return along, [e.laws(data, step.get(e)) for e in between]
+
+    def of_laws(
+        self,
+        data: pin.Data,
+        q: FloatArray,
+        v: FloatArray,
+        step: Mapping[Evaluator, BushingStep] = MappingProxyType({}),
+    ) -> FloatArray:
+        """Generalised forces (nv,) of all elements with laws; ``step`` as for
+        :meth:`generalised`."""
+        tau = self.laws(data, q, v, step)[0]
+        for element in self._elements:
+            if isinstance(element, LawEvaluator):
+                element.apply(tau, data, element.laws(data, step.get(element)), step.get(element))
+        return tau
+
+    def without_laws(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> FloatArray:
+        """Generalised forces (nv,) of all other elements."""
+        tau = np.zeros(self._nv)
+        for element in self._elements:
+            if not isinstance(element, _LAWFUL):
+                element.add(tau, data, q, v, t)
+        return tau
+
+    @property
+    def has_laws(self) -> bool:
+        """Whether elements have laws."""
+        return any(isinstance(element, _LAWFUL) for element in self._elements)
+
+    @property
+    def law_count(self) -> int:
+        """Number of the laws of elements between links."""
+        return sum(e.law_count for e in self._elements if isinstance(e, LawEvaluator))
 
     def generalised_with(
         self,

@@ -24,7 +24,14 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import geometry_of
-from srm_mbs.dynamics.constraints.projection import PIVOT_SHARE, PIVOT_WINDOW, Projection
+from srm_mbs.dynamics.constraints.projection import (
+    PIVOT_SHARE,
+    PIVOT_WINDOW,
+    Projection,
+    cholesky,
+    unwhiten,
+    whiten,
+)
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import coordinate_parents, graph_order
 from srm_mbs.dynamics.constraints.rows import COINCIDENT
@@ -40,7 +47,7 @@ from srm_mbs.dynamics.forces import (
 from srm_mbs.dynamics.manifold import Manifold
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import constraint_units
-from srm_mbs.dynamics.system import SingularityAnalysis, Terms, Zone
+from srm_mbs.dynamics.system import AccelerationDerivatives, SingularityAnalysis, Terms, Zone
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.mechanism import per_model, per_start
 
@@ -336,6 +343,12 @@ class Mechanics(Manifold):
             acted[self._forces.coordinates()] = True
         return np.flatnonzero(acted)
 
+    @cached_property
+    def _joined(self) -> ForceKinematics | None:
+        """The elements, if the generalised forces of all laws are one law; see
+        :attr:`ClosedSystem.laws`."""
+        return None
+
     @property
     def laws(self) -> FloatArray:
         """Values (m,) of the laws of forces at the stage evaluated last: those of the coordinates
@@ -362,6 +375,8 @@ class Mechanics(Manifold):
         """Damping and friction, or what acts in place of the laws of the coordinates."""
         if self._applied is None:
             return self.damping_force(v) + self.friction_force(v)
+        if self._joined is not None:
+            return self._applied
         force = np.zeros(self.nv)
         force[self._law_coordinates] = self._applied[: len(self._law_coordinates)]
         return force
@@ -372,12 +387,43 @@ class Mechanics(Manifold):
         """The generalised forces (nv,) of the elements, or of what acts in place of their laws."""
         if self._applied is None:
             return forces.generalised(self.data, q, v, t, self._bushings)
+        if self._joined is not None:
+            return forces.without_laws(self.data, q, v, t)
         applied = self._applied[len(self._law_coordinates) :]
         return forces.generalised_with(self.data, q, v, t, applied, self._bushings)
 
     def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Controller, joint damping and joint friction (nv,)."""
         return self.controlled_force(t, q, v) + self._passive_force(v)
+
+    def _forces_at(self, t: float, state: FloatArray) -> FloatArray:
+        """All forces (nv,) but those of inertia, gravity and closures."""
+        t = min(max(t, self._first), self._last)
+        q, v = state[: self.nq], state[self.nq :]
+        force = self.applied_force(t, q, v)
+        if self._forces is not None:
+            pin.forwardKinematics(self.model, self.data, q, v)
+            pin.computeJointJacobians(self.model, self.data)
+            force = force + self._element_force(self._forces, t, q, v)
+        self._laws_at = q, v
+        return force
+
+    def _tree_derivatives(
+        self, state: FloatArray, accelerations: FloatArray, normals: FloatArray
+    ) -> AccelerationDerivatives | None:
+        """See :class:`~srm_mbs.dynamics.system.System`, for closures whose G is constant, with
+        their M-orthonormal ``normals`` N (nv, k): da = (M^-1 - N N^T) (df - dID), ID the inverse
+        dynamics."""
+        model = self.model
+        if len(model.mimicking_joints) or model.gravity.angular.any():
+            return None
+        q, v = state[: self.nq], state[self.nq :]
+        by_q, by_v, M = pin.computeRNEADerivatives(model, self.data, q, v, accelerations)
+        U = cholesky(M)
+        by_forces = unwhiten(U, whiten(U, np.eye(self.nv))) - normals @ normals.T
+        return AccelerationDerivatives(
+            by_forces, -by_forces @ by_q, -by_forces @ by_v, self._forces_at
+        )
 
     def working_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Generalised forces (nv,) that do work: all but those of inertia and of closures."""
@@ -474,20 +520,20 @@ class OpenSystem(Mechanics):
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
         """v' = aba(q, v, tau); see :class:`~srm_mbs.dynamics.system.System`."""
         self.evaluations += 1
-        t = min(max(t, self._first), self._last)
         q, v = state[: self.nq], state[self.nq :]
-        force = self.applied_force(t, q, v)
-        if self._forces is not None:
-            pin.forwardKinematics(self.model, self.data, q, v)
-            pin.computeJointJacobians(self.model, self.data)
-            force = force + self._element_force(self._forces, t, q, v)
-        self._laws_at = q, v
+        force = self._forces_at(t, state)
         rate = self._terms.rate()
         rate[: self.nv] = v
         rate[self.nv :] = pin.aba(self.model, self.data, q, v, force)
         if not np.isfinite(rate).all():
             raise EvaluationError("the acceleration is not finite")
         return self._terms
+
+    def derivatives(
+        self, state: FloatArray, accelerations: FloatArray
+    ) -> AccelerationDerivatives | None:
+        """See :class:`~srm_mbs.dynamics.system.System`."""
+        return self._tree_derivatives(state, accelerations, np.zeros((self.nv, 0)))
 
 
 @per_model
@@ -535,6 +581,26 @@ class ClosedSystem(Mechanics):
         """The rows of closures and drives that are in use, with memory of their own."""
         curves = self.mechanism.drive_curves
         return _rows_in_use(self.mechanism).copy_workspace().follow(curves)
+
+    @cached_property
+    def _joined(self) -> ForceKinematics | None:
+        forces = self._forces
+        if forces is None or not forces.has_laws:
+            return None
+        count = len(self._law_coordinates) + forces.law_count
+        return forces if count > self.nv - self.structure.rank else None
+
+    @property
+    def laws(self) -> FloatArray:
+        """As for open mechanisms; but more laws than degrees of freedom are one, because closures
+        may take up forces far larger than those that move the mechanism: M (1 - P) M^-1 times
+        their generalised forces (nv,), which is what closures leave of them."""
+        if self._joined is None:
+            return super().laws
+        q, v = self._laws_at
+        force = self.damping_force(v) + self.friction_force(v)
+        force = force + self._joined.of_laws(self.data, q, v, self._bushings)
+        return self.projection.tangential_force(force)
 
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""
@@ -621,6 +687,16 @@ class ClosedSystem(Mechanics):
                     )
                 projection.hold(zone.normals)
         return ClosedTerms(self, v, predicted)
+
+    def derivatives(
+        self, state: FloatArray, accelerations: FloatArray
+    ) -> AccelerationDerivatives | None:
+        """See :class:`~srm_mbs.dynamics.system.System`: of closures of joint coordinates alone,
+        whose G is constant."""
+        p = self.projection
+        if not self.loops.is_constant or self._joined is not None or p.rank_deficient:
+            return None
+        return self._tree_derivatives(state, accelerations, p.normals())
 
     def constraint_residual(self, t: float, state: FloatArray) -> float:
         """max |g| over row units; see :class:`~srm_mbs.dynamics.system.System`."""

@@ -143,6 +143,27 @@ class SingularityAnalysis:
         return state[..., :nq], state[..., nq:]
 
 
+@dataclass(frozen=True, eq=False)
+class AccelerationDerivatives:
+    """Derivatives of the accelerations (k,) at a stage.
+
+    Attributes
+    ----------
+    by_forces : (k, k)
+        By the forces.
+    by_positions, by_velocities : (k, k)
+        By the chart coordinates at the stage, while the forces are held.
+    forces
+        (t (s), state (nx,)) -> (k,), all forces but those of inertia, gravity and closures; as an
+        evaluation, it finds :attr:`System.laws`.
+    """
+
+    by_forces: FloatArray
+    by_positions: FloatArray
+    by_velocities: FloatArray
+    forces: Callable[[float, FloatArray], FloatArray]
+
+
 class System(Protocol):
     """The equations of a mechanism, or of a DAE, as time integration evaluates them."""
 
@@ -174,6 +195,12 @@ class System(Protocol):
     def apply_laws(self, values: FloatArray | None) -> None:
         """Let ``values`` (m,) act in evaluations in place of the laws of forces that damp or store
         energy; None for the laws themselves."""
+
+    def derivatives(
+        self, state: FloatArray, accelerations: FloatArray
+    ) -> AccelerationDerivatives | None:
+        """Derivatives at the ``state`` (nx,) evaluated last, with the ``accelerations`` (k,) there;
+        None if only differences give them.  Other terms of the stage are lost."""
 
     @property
     def singularities(self) -> SingularityAnalysis | None:

@@ -16,7 +16,6 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.assembly.assemble import assemble
 from srm_mbs.assembly.position import limit_springs
-from srm_mbs.dynamics.constraints.projection import cholesky, whiten
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import (
     AssemblyError,
@@ -126,38 +125,12 @@ def _without_locked(
     return lock_joints(model, list(description.lock), frozen), q, v, guess
 
 
-def friction_time(model: pin.Model, q: FloatArray, friction_speed: float) -> float:
-    """Shortest time (s) in which friction stops a slow joint of the open tree at q (nq,).
-
-    1 over the largest eigenvalue of M^-1 diag(F)/v_s, with the friction speed v_s (rad/s, m/s);
-    infinite without friction.  Steps of explicit schemes stay below a few times it while a joint
-    rests.
-
-    Raises
-    ------
-    EvaluationError
-        If the mass matrix is not positive definite.
-    """
-    rough = np.flatnonzero(model.friction)
-    if not rough.size:
-        return np.inf
-    U = cholesky(pin.crba(model, workspace(model), q))
-    roots = np.zeros((model.nv, rough.size), order="F")
-    roots[rough, range(rough.size)] = np.sqrt(model.friction[rough] / friction_speed)
-    return float(1.0 / np.linalg.norm(whiten(U, roots), 2) ** 2)
-
-
-def _friction_note(model: pin.Model, q: FloatArray, friction_speed: float) -> tuple[str, ...]:
-    try:
-        time = friction_time(model, q, friction_speed)
-    except EvaluationError:  # in gimbal lock, which is reported elsewhere
-        time = np.inf
-    if time == np.inf:
+def _friction_note(model: pin.Model, friction_speed: float) -> tuple[str, ...]:
+    if not model.friction.any():
         return ()
     return (
         "joint friction F acts as F tanh(v/v_s) with v_s = "
-        f"{friction_speed:g} rad/s or m/s; a joint at rest keeps steps below about "
-        f"{6.0 * time:.0e} s, in proportion to v_s: set it with friction_speed",
+        f"{friction_speed:g} rad/s or m/s: set it with friction_speed",
     )
 
 
@@ -229,7 +202,7 @@ def unassembled(
         name=description.name or model.name,
         source=source,
         defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
-        notes=(*reading.notes, *built.notes, *_friction_note(model, start, friction_speed)),
+        notes=(*reading.notes, *built.notes, *_friction_note(model, friction_speed)),
     )
     if description.limits == "spring":
         mechanism = _with_limit_springs(mechanism)
@@ -299,6 +272,42 @@ def _in_gimbal_lock(source: Source, why: str) -> InputError:
     )
 
 
+ROTOR_INERTIA = 1e-9
+"""Inertia of a rotor on a damped joint without any in one direction, over the composite inertia:
+less than tolerances show, and enough for accelerations to be above rounding."""
+
+
+def _with_rotors(mechanism: Mechanism) -> Mechanism:
+    """The mechanism with rotors on damped joints that move no inertia at the start, and a note.
+
+    Damping d alone determines the motion along such a direction, as for d -> 0 of the inertia.
+    """
+    model, source = mechanism.model, mechanism.source
+    armature, names = np.array(model.armature), []
+    for _ in range(model.njoints):
+        path = None if source is None else source.urdf_path
+        at = undetermined_joint(model, mechanism.q0, path, ROTOR_INERTIA)
+        if at is None:
+            break
+        own = slice(model.idx_vs[at], model.idx_vs[at] + model.nvs[at])
+        if not model.damping[own].all():
+            break
+        if not names:
+            model = model.copy()
+        names.append(model.names[at])
+        composite = np.diag(pin.crba(model, workspace(model), mechanism.q0))
+        armature[own] += 2.0 * ROTOR_INERTIA * composite[own]
+        model.armature = armature
+    if not names:
+        return mechanism
+    note = (
+        f"the inertia that {', '.join(map(repr, names))} moves vanishes in one direction at the "
+        f"start: damping determines the motion there, and a rotor of {2.0 * ROTOR_INERTIA:g} of "
+        "what the joint carries is added; give the links at its end a moment of inertia"
+    )
+    return replace(mechanism, model=model, notes=(*mechanism.notes, note))
+
+
 def assembled(reading: Reading) -> Mechanism:
     """The mechanism with its loops closed.
 
@@ -325,6 +334,7 @@ def assembled(reading: Reading) -> Mechanism:
         raise
     except EvaluationError as error:
         raise _in_gimbal_lock(source, str(error)) from error
+    mechanism = _with_rotors(mechanism)
     joint = undetermined_joint(mechanism.model, mechanism.q0, source.urdf_path)
     if joint is not None:
         raise _in_gimbal_lock(

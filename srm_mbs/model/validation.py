@@ -68,8 +68,15 @@ def check_inertia(model: pin.Model, file: str | None = None) -> None:
         )
 
 
-def undetermined_joint(model: pin.Model, q: FloatArray, file: str | None = None) -> int | None:
+def undetermined_joint(
+    model: pin.Model,
+    q: FloatArray,
+    file: str | None = None,
+    least: float = ARTICULATED_INERTIA_TOLERANCE,
+) -> int | None:
     """A joint with a direction in which it moves no inertia at q (nq,); None if there is none.
+
+    No inertia is one below ``least`` of the composite inertia.
 
     Examples are an axis through a point mass, and the outer axes of massless links in line.  Such
     joints are found by the pivots of the Cholesky factorisation of M, scaled to a unit diagonal and
@@ -96,9 +103,7 @@ def undetermined_joint(model: pin.Model, q: FloatArray, file: str | None = None)
         failed = int(bad[0])
     else:
         factor, info = dpotrf(scaled, lower=1)
-        small = np.flatnonzero(
-            np.diag(factor)[: info - 1 if info else None] ** 2 < ARTICULATED_INERTIA_TOLERANCE
-        )
+        small = np.flatnonzero(np.diag(factor)[: info - 1 if info else None] ** 2 < least)
         if not small.size and not info:
             return None
         failed = int(small[0]) if small.size else info - 1

@@ -29,7 +29,13 @@ from benchmarks.work_precision import (
 from benchmarks.work_precision.counting import Point, cheapest
 from benchmarks.work_precision.harness import attempt, errors_of, measure_problem, sweep
 from benchmarks.work_precision.peers import PEERS
-from benchmarks.work_precision.peers.base import Outcome, OverBudgetError, Peer, Setting
+from benchmarks.work_precision.peers.base import (
+    NotApplicableError,
+    Outcome,
+    OverBudgetError,
+    Peer,
+    Setting,
+)
 from benchmarks.work_precision.problems import PROBLEMS, andrews
 from benchmarks.work_precision.problems.base import Problem
 from benchmarks.work_precision.records import Measurement, Results
@@ -176,7 +182,48 @@ def test_failed_runs_count_as_wrong_and_leave_median_or_worst_open() -> None:
     assert summary([None, None, 1e-9]) == {"right": 1, "median": None, "worst": None}
 
 
-@pytest.mark.parametrize("name", [name for name in PROBLEMS if not name.endswith("_40")])
+STIFF = ("bushing", "friction", "governor")
+
+
+@pytest.mark.parametrize("name", STIFF)
+def test_the_reduced_equations_of_stiff_problems_are_ours(name: str) -> None:
+    problem = shared(name)
+    mechanism, model = problem.mechanism, problem.reduced
+    assert problem.stiff
+    assert model is not None
+    nv = mechanism.model.nv
+    # Later states as well: at the start springs are relaxed, and some joints at rest.
+    for q, v in [(mechanism.q0, mechanism.v0), (x[0] for x in srm.simulate(mechanism, 0.1)([0.1]))]:
+        ours = make_system(mechanism).evaluate(0.0, np.concatenate([q, v])).rate()[nv:]
+        if name == "friction":
+            ours, start = ours[:1], np.array([q[0], v[0]])
+        else:
+            start = np.concatenate([q, v])
+        theirs = np.asarray(model.field(0.0, start))[len(start) // 2 :]
+        assert np.abs(ours - theirs).max() < 1e-9 * (np.abs(ours).max() + 1.0)
+
+
+def test_implicit_integrators_are_measured_on_stiff_problems_alone() -> None:
+    out = Results({"processor": "some"}, {"pin": pin.__version__}, {"repeats": 2})
+    peers = [PEERS[name] for name in ("ours", "reduced", "reduced_radau", "mujoco")]
+    measure_problem(
+        shared("friction"),
+        peers,
+        out,
+        repeats=2,
+        choose=lambda settings: [each for each in settings if each.value == 1e-5],
+        say=quiet,
+    )
+    assert {row.peer for row in out.measurements} == {"ours", "reduced_radau"}
+    assert all(row.error is not None and row.error < 1e-2 for row in out.measurements)
+    assert {row.peer for row in out.skipped} == {"reduced", "mujoco"}
+    with pytest.raises(NotApplicableError, match="are for stiff problems"):
+        PEERS["reduced_radau"].check(shared("slider_crank_whirl"))
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in PROBLEMS if not name.endswith("_40") and name not in STIFF]
+)
 def test_the_equations_of_the_peers_are_ours(name: str) -> None:
     problem = shared(name)
     tree = problem.tree

@@ -172,6 +172,15 @@ def test_info_tells_what_was_read_and_what_was_ignored(tmp_path: Path) -> None:
     assert "note: 1 <transmission> element(s) do not act and are ignored" in output
 
 
+def test_info_lists_what_is_stiff_with_coefficients_and_times() -> None:
+    output = run("info", "flyball_governor")
+    found = row(output, "force left_spring")
+    coefficient, seconds = re.split("  +", found)
+    assert coefficient == "damping 40000 N s/m"
+    assert seconds == "0.00021 s"
+    assert "time constant" not in run("info", "four_bar")
+
+
 def test_info_of_an_open_chain_has_no_table_of_loops() -> None:
     output = run("info", "pendulum_chain")
     assert row(output, "degrees of freedom") == "3"

@@ -14,11 +14,26 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.integration.methods.base import ErrorNorm, Linearisation
+from srm_mbs.integration.methods.linear_split_step import LinearSplitStep, linearised
+from srm_mbs.integration.methods.tableaus import get_tableau
+from tests.support.commands import run as command
 from tests.support.convergence import fitted_order, observed_order, turning
 from tests.support.mechanisms import floating_ring
-from tests.support.stiff import bushed_four_bar, bushed_reference, follower, rubbing
+from tests.support.reduced import slider_crank
+from tests.support.stiff import (
+    bushed_four_bar,
+    bushed_reference,
+    by_radau,
+    driven_reference,
+    follower,
+    guided_four_bar,
+    rubbing,
+)
 
 BACKENDS = ("kernel", "python")
+SLOW_PYTHON = ("kernel", pytest.param("python", marks=pytest.mark.stress))
 
 
 def end_of(solution: srm.Solution) -> FloatArray:
@@ -55,6 +70,65 @@ def test_stiff_forces_of_a_controller_leave_at_least_order_four(rate: float) -> 
         errors.append(abs(run.q[:, 0] - np.sin(run.t)).max())
     assert errors[-1] < 1e-5
     assert fitted_order(steps, errors) >= 3.9
+
+
+# Linearisation
+
+ROBOTS = Path(__file__).parents[1] / "data" / "robots"
+
+
+def coupled_panda() -> srm.Mechanism:
+    """An arm with damping, friction and a spring, whose first joints are coupled."""
+    arm = srm.load(ROBOTS / "example_robot_data" / "panda.urdf")
+    model, names = arm.model.copy(), arm.joint_names
+    rubs = np.arange(model.nv) < 5
+    model.damping, model.friction = np.where(rubs, 30.0, 0.0), np.where(rubs, 5.0, 0.0)
+    links = [f.name for f in model.frames if f.type == pin.FrameType.BODY]
+    spring = srm.SpringDamper(
+        srm.Anchor(links[1]), srm.Anchor(links[-1]), stiffness=2e3, damping=5.0, rest_length=0.2
+    )
+    gear = srm.LoopClosure("coupling", joints=(names[0], names[1]), ratio=0.5)
+    return replace(arm, model=model, forces=(spring,), loops=(gear,))
+
+
+@pytest.mark.parametrize(
+    "mechanism",
+    [
+        lambda: srm.load(ROBOTS / "dm_control" / "humanoid.xml"),
+        lambda: srm.load(ROBOTS / "example_robot_data" / "simple_humanoid.urdf"),
+        coupled_panda,
+    ],
+    ids=["free joint, damped", "composite joints", "coupling, spring, friction"],
+)
+def test_closed_form_derivatives_are_those_of_differences(
+    mechanism: Callable[[], srm.Mechanism], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = make_system(mechanism())
+    n = system.tangent_size
+    norm = ErrorNorm(np.full(n, 1e-6), 1e-6)
+    random = 0.3 * np.random.default_rng(0).standard_normal(n)
+    start = np.concatenate([system.mechanism.q0, system.mechanism.v0])
+    state = system.retract(start, random)
+    memory = LinearSplitStep(get_tableau("rodas5p")).start(system, 0.0, state, norm)
+
+    def found() -> Linearisation:
+        return linearised(system, 0.0, 1e-3, state, memory, norm, None)
+
+    closed = found()
+    assert system.derivatives(state, closed.rate[system.nv :]) is not None
+    monkeypatch.setattr(type(system), "derivatives", lambda *_: None)
+    differences = found()
+    for name in ("J", "by_laws", "by_coordinates"):
+        own, other = getattr(closed, name), getattr(differences, name)
+        np.testing.assert_allclose(
+            own, other, rtol=1e-6, atol=1e-6 * np.abs(other).max(initial=1.0)
+        )
+
+
+def test_a_linearisation_in_closed_form_takes_no_evaluation_for_each_coordinate() -> None:
+    run = srm.simulate(coupled_panda(), 0.2, tableau="rodas5p")
+    tried = run.stats.steps + run.stats.rejected
+    assert run.stats.evaluations < 12 * tried
 
 
 # Accuracy and cost
@@ -137,6 +211,86 @@ def test_undamped_stiff_springs_stay_with_explicit_steps() -> None:
         assert np.array_equal(run.q, own.q)
 
 
+@pytest.mark.parametrize("backend", SLOW_PYTHON)
+def test_the_cost_does_not_grow_with_forces_that_closures_take_up(backend: str) -> None:
+    """A bushing with two directions on one degree of freedom: across the path of its point the
+    force is proportional to the damping, and no motion follows from it."""
+    steps, ends = [], []
+    for tau in (1e-4, 1e-6, 1e-8):
+        run = srm.simulate(guided_four_bar(tau), 0.15, tableau="rodas5p", backend=backend)
+        steps.append(run.stats.steps)
+        ends.append(end_of(run)[:3])
+    assert max(steps) < 1.6 * min(steps)
+    # The limit of infinite damping is met to the order of the time constant.
+    np.testing.assert_allclose(ends[1], ends[2], rtol=0.0, atol=1e-5)
+
+
+# Singular configurations, drives, friction that turns
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6])
+def test_a_stiff_motion_passes_a_singular_configuration(rtol: float, backend: str) -> None:
+    """Equal bars, driven from 45 to 137 degrees by an overdamped spring on the crank: the bars
+    fold at 90 degrees.  2 (4/3 + 4 sin^2) theta'' = ... - c theta' - k (theta - 2.4), by Radau."""
+    c, rest = 1e5, 2.4
+    spring = srm.TorsionSpring("crank", stiffness=5.0 * c, rest_angle=rest, damping=c)
+    mechanism = srm.load("slider_crank_whirl")
+    times = np.linspace(0.05, 0.5, 10)
+    run = srm.simulate(
+        replace(mechanism, forces=(spring,)), 0.5, t_eval=times, rtol=rtol, backend=backend
+    )
+    free = slider_crank()
+
+    def field(t: float, y: FloatArray) -> list[float]:
+        torque = 0.5 * (-c * y[1] - 5.0 * c * (y[0] - rest))
+        return [y[1], free(t, y)[1] + torque / (4.0 / 3.0 + 4.0 * np.sin(y[0]) ** 2)]
+
+    expected = by_radau(field, [mechanism.q0[0], mechanism.v0[0]], times)
+    assert run.success
+    assert run.settings.stiff
+    assert run.q[0, 0] < 0.5 * np.pi < run.q[-1, 0]
+    np.testing.assert_allclose(run.q[:, 0], expected[:, 0], rtol=0.0, atol=20.0 * rtol)
+    np.testing.assert_allclose(run.v[:, 0], expected[:, 1], rtol=0.0, atol=100.0 * rtol)
+    assert run.stats.steps < 300
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_driven_stiff_mechanisms_follow_their_reduced_equations(backend: str) -> None:
+    tau, t_end = 1e-6, 0.2
+    mechanism = bushed_four_bar(tau)
+    drive = srm.Drive(srm.ConstantSpeed(float(mechanism.v0[0])), "crank")
+    run = srm.simulate(replace(mechanism, drives=(drive,)), t_end, rtol=1e-7, backend=backend)
+    assert run.settings.stiff
+    expected = driven_reference(mechanism, tau, t_end)
+    np.testing.assert_allclose(end_of(run)[:3], expected, rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("backend", SLOW_PYTHON)
+def test_friction_that_changes_its_direction_is_resolved(backend: str) -> None:
+    """A pendulum, at rest at the start, that turns back twice, v_s = 1e-4, and when it does."""
+    F, speed = 0.2, 1e-4
+    mechanism = rubbing("simple_pendulum", F, speed)
+    turning_back = srm.Event(lambda t, q, v: v[0])
+    run = srm.simulate(mechanism, 2.5, rtol=1e-7, events=turning_back, backend=backend)
+    model = mechanism.model
+    data = model.createData()
+
+    def field(t: float, y: FloatArray) -> list[float]:
+        load = pin.computeGeneralizedGravity(model, data, y[:1])[0]
+        return [y[1], -load - F * np.tanh(y[1] / speed)]
+
+    start = [mechanism.q0[0], mechanism.v0[0]]
+    reference = solve_ivp(
+        field, (0.0, 2.5), start, "Radau", rtol=1e-9, atol=1e-11, events=lambda t, y: y[1]
+    )
+    assert run.t_events is not None
+    found = run.t_events[0]
+    assert len(found) == 2
+    np.testing.assert_allclose(found, reference.t_events[0][1:], rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(end_of(run), reference.y[:, -1], rtol=0.0, atol=1e-5)
+
+
 # Both backends
 
 
@@ -160,6 +314,7 @@ def cases() -> dict[str, tuple[srm.Mechanism, dict[str, Any]]]:
         "friction": (rubbing("four_bar", 2.0, 1e-3), {"t_end": 6.0, "rtol": 1e-8}),
         "governor": (srm.load("flyball_governor"), {}),
         "controller": (follower_mechanism, {"controller": force}),
+        "coupling": (coupled_panda(), {"t_end": 0.02}),
         "sampled": (bushed_four_bar(1e-6), {"controller": swaying, "sample_time": 5e-2}),
         "user force": (replace(driven, forces=(own,)), {"t_end": 0.1}),
         "Lie group": (replace(ring, model=damped), {}),
@@ -181,6 +336,36 @@ def test_kernel_and_reference_make_the_same_steps(name: str, tableau: str) -> No
     times = np.linspace(0.0, float(kernel.t[-1]), 41)
     for read, other in zip(kernel(times), reference(times)):
         np.testing.assert_allclose(read, other, rtol=0.0, atol=2e-4)
+
+
+# Sweeps and the command line
+
+
+@pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
+def test_sweeps_make_stiff_runs_as_single_runs_do(tableau: str) -> None:
+    mechanism = bushed_four_bar(1e-6)
+    cases = [{"q0": mechanism.q0, "v0": factor * mechanism.v0} for factor in (1.0, 0.5)]
+    swept = srm.sweep(
+        mechanism, cases, 0.1, tableau=tableau, measure=lambda run: {"q": run.q[-1, 1]}
+    )
+    for case, own in zip(cases, swept.table["q"]):
+        start = mechanism.with_state(**case)
+        assert own == srm.simulate(start, 0.1, tableau=tableau).q[-1, 1]
+
+
+@pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
+def test_the_command_line_takes_the_tableaus_for_stiff_problems(
+    tableau: str, tmp_path: Path
+) -> None:
+    out = tmp_path / "run.npz"
+    shown = command(
+        "simulate", "flyball_governor", "--t-end", 0.1, "--tableau", tableau, "--out", out
+    )
+    saved = srm.load_solution(out)
+    own = srm.simulate(srm.load("flyball_governor"), 0.1, tableau=tableau)
+    assert saved.settings == own.settings
+    assert np.array_equal(saved.q, own.q)
+    assert ("Stiff, with steps of rodas5p" in shown) == (tableau == "auto")
 
 
 # What runs say
@@ -296,3 +481,44 @@ def test_a_stiff_dae_is_solved() -> None:
     assert run.success
     assert abs(run.x[-1, 0] - np.cos(2.0)) < 1e-5
     assert run.stats.steps < 500
+
+
+# Directions without inertia
+
+HEAD = """<robot name="head"><link name="base"/><link name="yoke"/>
+<link name="head"><inertial><origin xyz="0.02 0 0.1"/><mass value="1.3"/>
+<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="roll" type="continuous"><parent link="base"/><child link="yoke"/>
+<axis xyz="1 0 0"/>{dynamics}</joint>
+<joint name="yaw" type="continuous"><parent link="yoke"/><child link="head"/>
+<axis xyz="0 0 1"/>{dynamics}</joint></robot>"""
+"""A point mass in the plane of two axes: it moves along one direction only."""
+
+
+def test_damping_moves_a_joint_that_has_no_inertia_at_the_start(tmp_path: Path) -> None:
+    (tmp_path / "head.urdf").write_text(HEAD.format(dynamics='<dynamics damping="0.5"/>'))
+    path = tmp_path / "head.toml"
+    path.write_text('format = 1\nurdf = "head.urdf"\ngravity = [3.0, 4.0, -9.81]\n')
+    mechanism = srm.load(path)
+    (note,) = mechanism.notes
+    assert "'roll' moves vanishes in one direction" in note
+    run = srm.simulate(mechanism, 1.0, rtol=1e-7)
+    model = mechanism.model.copy()
+    model.armature = np.full(2, 1e-8)
+    data = model.createData()
+
+    def field(t: float, y: FloatArray) -> FloatArray:
+        q, v = y[:2], y[2:]
+        q = np.ravel(np.column_stack([np.cos(q), np.sin(q)]))
+        return np.concatenate([v, pin.aba(model, data, q, v, -0.5 * v)])
+
+    reference = solve_ivp(field, (0.0, 1.0), np.zeros(4), method="Radau", rtol=1e-9, atol=1e-11)
+    angles = [run.joint(name)[0][-1] for name in ("roll", "yaw")]
+    np.testing.assert_allclose(angles, reference.y[:2, -1], rtol=0.0, atol=1e-6)
+
+
+def test_without_damping_such_a_start_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "head.urdf"
+    path.write_text(HEAD.format(dynamics=""))
+    with pytest.raises(srm.InputError, match="the joint 'roll' moves no inertia there"):
+        srm.load(path)

@@ -19,7 +19,6 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.analysis.summary import force_rows
 from srm_mbs.cli.tables import equilibrium_rows
 from srm_mbs.dynamics.multibody import make_system
-from srm_mbs.formats.build import friction_time
 from tests.support.bundled import finished
 from tests.support.dynamics import mass_matrix
 from tests.support.mechanisms import add_link, random_state, rod
@@ -480,23 +479,6 @@ def test_friction_acts_beside_damping_on_open_and_closed_mechanisms(name: str) -
         rtol=1e-12,
         atol=1e-12,
     )
-
-
-def test_the_time_of_friction_is_that_of_the_fastest_joint() -> None:
-    """A joint with more friction and less inertia sets it; alone it is m s/F."""
-
-    def time_of(mechanism: srm.Mechanism) -> float:
-        return friction_time(mechanism.model, mechanism.q0, mechanism.friction_speed)
-
-    assert time_of(rubbing(3.0)) == pytest.approx(2.0 * SPEED / 3.0)
-    assert time_of(rubbing(0.0)) == np.inf
-    chain = srm.load("pendulum_chain")
-    model = chain.model.copy()
-    model.friction = np.array([0.3, 0.0, 0.7])
-    M = mass_matrix(model, chain.q0)
-    fastest = np.abs(np.linalg.eigvals(np.linalg.solve(M, np.diag(model.friction)))).max() / SPEED
-    rough = replace(chain, model=model, friction_speed=SPEED)
-    assert time_of(rough) == pytest.approx(1.0 / fastest, rel=1e-10)
 
 
 def test_the_friction_speed_is_saved(tmp_path: Path) -> None:

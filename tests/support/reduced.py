@@ -65,10 +65,11 @@ def slider_crank(slider_mass: float = 0.0) -> Field:
     return field
 
 
-def regular_slider_crank() -> Field:
+def regular_slider_crank(torque: Callable[[float], float] = lambda rate: 0.0) -> Field:
     """Crank 1 m 1 kg, rod 3 m 3 kg, uniform, massless slider on the x axis: Lagrange by hand.
 
     With the rod's angle beta, sin beta = -sin theta / 3, the kinetic energy is I(theta) w^2 / 2.
+    ``torque``: on the crank (N m) at its rate w (rad/s).
     """
 
     def inertia(theta: float) -> tuple[float, float]:
@@ -91,7 +92,7 @@ def regular_slider_crank() -> Field:
         value, slope = inertia(theta)
         c = np.cos(theta)
         # potential: crank centre sin/2, rod centre sin/2 (the slider stays at z = 0)
-        force = -G * (0.5 * c + 3.0 * 0.5 * c)
+        force = torque(w) - G * (0.5 * c + 3.0 * 0.5 * c)
         return [w, (force - 0.5 * slope * w * w) / value]
 
     return field

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -34,16 +35,31 @@ def bushed_four_bar(tau: float) -> srm.Mechanism:
     return replace(open_chain, forces=(bushing,))
 
 
-def bushed_reference(mechanism: srm.Mechanism, tau: float, t_end: float) -> FloatArray:
-    """Its state at ``t_end`` (s): Radau on Pinocchio's aba, the force in the rocker's axes by
-    hand."""
+def guided_four_bar(tau: float) -> srm.Mechanism:
+    """The four-bar with a bushing between its coupler and the ground, which damps 1 kg / ``tau``
+    (s) in both directions of the plane: one more than the mechanism can move along."""
+    c = 1.0 / tau
+    planar = np.array([1.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    bushing = srm.Bushing(
+        a=srm.Anchor("coupler", xyz=(1.0, 0.0, 0.0)),
+        b=srm.Anchor("world", xyz=(1.0, 0.0, 1.0)),
+        stiffness=tuple(RATE * c * planar),
+        damping=tuple(c * planar),
+        name="guide",
+    )
+    return replace(srm.load("four_bar"), forces=(bushing,))
+
+
+def bushed_forces(
+    mechanism: srm.Mechanism, tau: float
+) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """Its generalised forces of the bushing at (q, v), the force in the rocker's axes by hand."""
     model = mechanism.model
     data = model.createData()
     frames = [model.getFrameId(name, pin.FrameType.BODY) for name in ("coupler", "rocker")]
     c = 1.0 / tau
 
-    def field(t: float, y: FloatArray) -> FloatArray:
-        q, v = y[: model.nq], y[model.nq :]
+    def forces(q: FloatArray, v: FloatArray) -> FloatArray:
         pin.computeJointJacobians(model, data, q)
         pin.updateFramePlacements(model, data)
         points, jacobians = [], []
@@ -58,13 +74,79 @@ def bushed_reference(mechanism: srm.Mechanism, tau: float, t_end: float) -> Floa
         relative = jacobians[0] - (J[:3] - pin.skew(arm) @ J[3:])
         force = -RATE * c * (points[0] - points[1]) - c * (relative @ v)
         force[1] = 0.0
-        return np.concatenate([v, pin.aba(model, data, q, v, relative.T @ force)])
+        tau_q: FloatArray = relative.T @ force
+        return tau_q
 
-    start = np.concatenate([mechanism.q0, mechanism.v0])
-    run = solve_ivp(field, (0.0, t_end), start, method="Radau", rtol=1e-10, atol=1e-11)
+    return forces
+
+
+def differenced(field: Callable[[float, FloatArray], Any]) -> Callable[..., FloatArray]:
+    """The Jacobian (n, n) of a field by one-sided differences.  The steps of SciPy's own grow
+    without limit in coordinates on which nothing depends."""
+
+    def jacobian(t: float, y: FloatArray) -> FloatArray:
+        here = np.asarray(field(t, y))
+        steps = 2.0**-26 * np.maximum(1.0, np.abs(y))
+        columns = [np.asarray(field(t, y + row)) - here for row in np.diag(steps)]
+        return np.column_stack(columns) / steps
+
+    return jacobian
+
+
+def by_radau(
+    field: Callable[[float, FloatArray], Any], start: Any, times: Any, rtol: float = 1e-10
+) -> FloatArray:
+    """States (k, n) of y' = field(t, y) at ``times`` (k,) s."""
+    run = solve_ivp(
+        field,
+        (0.0, times[-1]),
+        start,
+        "Radau",
+        t_eval=times,
+        rtol=rtol,
+        atol=0.1 * rtol,
+        jac=differenced(field),
+    )
     assert run.success
-    end: FloatArray = run.y[:, -1]
-    return end
+    states: FloatArray = run.y.T
+    return states
+
+
+def bushed_field(mechanism: srm.Mechanism, tau: float) -> Callable[[float, FloatArray], FloatArray]:
+    """The derivative of its state (q, v), from Pinocchio's aba."""
+    model = mechanism.model
+    data, forces = model.createData(), bushed_forces(mechanism, tau)
+
+    def field(t: float, y: FloatArray) -> FloatArray:
+        q, v = y[: model.nq], y[model.nq :]
+        return np.concatenate([v, pin.aba(model, data, q, v, forces(q, v))])
+
+    return field
+
+
+def bushed_reference(mechanism: srm.Mechanism, tau: float, t_end: float) -> FloatArray:
+    """Its state at ``t_end`` (s), by Radau."""
+    start = np.concatenate([mechanism.q0, mechanism.v0])
+    return by_radau(bushed_field(mechanism, tau), start, [t_end])[0]
+
+
+def driven_reference(mechanism: srm.Mechanism, tau: float, t_end: float) -> FloatArray:
+    """Positions at ``t_end`` (s) with the crank at its first speed: M_22 v_2' = f_2."""
+    model = mechanism.model
+    data, forces = model.createData(), bushed_forces(mechanism, tau)
+    speed = mechanism.v0[0]
+
+    def field(t: float, y: FloatArray) -> FloatArray:
+        q = np.array([mechanism.q0[0] + speed * t, *y[:2]])
+        v = np.array([speed, *y[2:]])
+        load = forces(q, v) - pin.nonLinearEffects(model, data, q, v)
+        M = pin.crba(model, data, q)
+        M = np.triu(M) + np.triu(M, 1).T
+        return np.concatenate([v[1:], np.linalg.solve(M[1:, 1:], load[1:])])
+
+    start = np.concatenate([mechanism.q0[1:], mechanism.v0[1:]])
+    end = by_radau(field, start, [t_end])[0]
+    return np.array([mechanism.q0[0] + speed * t_end, *end[:2]])
 
 
 def rubbing(name: str, friction: float, speed: float) -> srm.Mechanism:

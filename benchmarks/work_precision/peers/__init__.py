@@ -15,6 +15,11 @@ from benchmarks.work_precision.peers.pinocchio_dop853 import (
 )
 from benchmarks.work_precision.peers.pinocchio_projected import PinocchioRK4Projected
 from benchmarks.work_precision.peers.pinocchio_rk4 import PinocchioRK4Baumgarte
+from benchmarks.work_precision.peers.reduced_implicit import (
+    ReducedCVODE,
+    ReducedIDA,
+    ReducedRadau,
+)
 from benchmarks.work_precision.peers.reduced_ode import ReducedODE
 from benchmarks.work_precision.peers.scipy_dae_radau import ScipyDaeRadau
 from benchmarks.work_precision.peers.sundials_ida import SundialsIDA
@@ -33,6 +38,9 @@ PEERS: Mapping[str, Peer] = MappingProxyType(
             ExudynAlpha(),
             SundialsIDA(),
             ScipyDaeRadau(),
+            ReducedRadau(),
+            ReducedCVODE(),
+            ReducedIDA(),
         )
     }
 )

@@ -67,11 +67,23 @@ Runner = Callable[[Setting], Run]
 
 
 class Peer(ABC):
-    """One simulator.  ``modules``: what must be importable; otherwise the peer is skipped."""
+    """One simulator.
+
+    ``modules``: what must be importable; otherwise the peer is skipped.  ``implicit``: whether it
+    integrates the reduced equations of stiff problems, and no others.
+    """
 
     name: str
     title: str
     modules: tuple[str, ...] = ()
+    implicit = False
+
+    def check(self, problem: Problem) -> None:
+        """Raises NotApplicableError if the peer is not for problems of that kind."""
+        if problem.stiff and not self.implicit:
+            raise NotApplicableError("stiff problems are for implicit integrators")
+        if self.implicit and not problem.stiff:
+            raise NotApplicableError("implicit integrators are for stiff problems")
 
     def missing(self) -> str | None:
         """The first module that is not installed."""

@@ -13,6 +13,7 @@ from benchmarks.work_precision.problems.n_four_bars import n_four_bar
 from benchmarks.work_precision.problems.pendulum_chain import pendulum_chain
 from benchmarks.work_precision.problems.slider_cranks import regular, whirl
 from benchmarks.work_precision.problems.spatial_four_bar import spatial_four_bar
+from benchmarks.work_precision.problems.stiff import bushing, friction, governor
 from benchmarks.work_precision.problems.walking_robot import walking_robot
 
 PROBLEMS: Mapping[str, Callable[[], Problem]] = MappingProxyType(
@@ -25,5 +26,8 @@ PROBLEMS: Mapping[str, Callable[[], Problem]] = MappingProxyType(
         "walking_robot": walking_robot,
         "cassie": cassie,
         "pendulum_chain": pendulum_chain,
+        "bushing": bushing,
+        "friction": friction,
+        "governor": governor,
     }
 )

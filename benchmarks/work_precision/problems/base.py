@@ -22,10 +22,10 @@ Observer = Callable[[Array, Array], Array]
 
 @dataclass(frozen=True, eq=False)
 class ReducedModel:
-    """A mechanism of one degree of freedom in a coordinate of its own: y' = field(t, y), y(0)."""
+    """A mechanism in minimal coordinates of its own: y' = field(t, y), y(0)."""
 
     field: Callable[[float, Any], Any]
-    start: tuple[float, float]
+    start: tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,11 @@ class Problem:
     rates
         Which columns of the observation are velocities: all from this one on.
     reduced
-        The one-degree model, if there is one, whose (angle, rate) ``expand`` turns into columns.
+        The model in minimal coordinates, if there is one, whose state ``expand`` turns into
+        columns.
+    stiff
+        Whether forces are stiff: we take the tableaus for that, and the peers are implicit
+        integrators of the reduced model.
     singular
         Whether the motion passes through singular configurations.
     planar
@@ -68,6 +72,7 @@ class Problem:
     reduced: ReducedModel | None = None
     expand: Callable[[Array], Array] = lambda observed: observed
     singular: bool = False
+    stiff: bool = False
     planar: tuple[int, int] | None = None
     gains: tuple[float, ...] = (3.0, 10.0, 30.0)
     reference_of: Callable[[], Reference] | None = None

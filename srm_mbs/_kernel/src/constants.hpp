@@ -53,6 +53,8 @@ namespace srm {
     field(int, other_steps)                /* in a row that end a count */                         \
     field(double, not_stiff)               /* h |lambda| up to which explicit steps would do */    \
     field(int, power_iterations)                                                                   \
+    field(double, unresolved)              /* change of a rate over a step (friction speeds) */    \
+    field(double, reversal_share)          /* error of a jump in a step, over step times jump */   \
     field(double, difference)              /* by a coordinate, over its size */                    \
     field(double, time_difference)         /* by time, over the step */                            \
     field(double, shortest_difference)     /* by time (roundings of t) */                          \

@@ -64,6 +64,11 @@ public:
         times_q(white);
     }
 
+    void whiten_force(double* x) const override {
+        const int n = count();
+        for (int i = 0; i < n; ++i) x[i] = (x[i] - dot(&U_[i * n], x, i)) * inverse_[i];
+    }
+
     void whiten_velocity(double* x) const override {
         const int n = count();
         for (int i = 0; i < n; ++i) {

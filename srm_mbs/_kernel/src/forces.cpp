@@ -159,6 +159,11 @@ void ForceElement::check() const {
     if (curves.size() > 1) expect_size("curves", curves.size(), numbers.size());
 }
 
+bool acts_between_links(const ForceElement& e) {
+    return e.kind == ForceKind::spring_damper || e.kind == ForceKind::wrench ||
+           e.kind == ForceKind::bushing;
+}
+
 bool turns(const ForceElement& e) {
     if (e.kind != ForceKind::bushing) return false;
     const auto acts = [&](int first) {

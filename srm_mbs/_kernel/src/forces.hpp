@@ -50,6 +50,9 @@ struct ForceElement {
     void check() const;
 };
 
+// Whether an element acts at points of links, not on the coordinate of a joint.
+bool acts_between_links(const ForceElement& element);
+
 // Whether an element is a bushing that has a moment.
 bool turns(const ForceElement& element);
 
@@ -81,6 +84,8 @@ public:
     // `passive` (nv,): whether damping or friction acts on a coordinate.
     void resolve(const std::vector<ForceElement>& elements, const std::vector<bool>& passive);
     int count() const { return static_cast<int>(values.size()); }
+    // Makes them one law: the forces along the coordinates (nv,) of all of them.
+    void join(int nv) { values.assign(nv, 0.0); }
     // The value that acts as number `law`, which is `value` by itself.
     double acting(int law, double value) {
         values[law] = value;

@@ -35,6 +35,7 @@ LinearStages::LinearStages(System& system, double gamma, std::vector<double> uni
       by_time_(n_),
       applied_(count_),
       laws_(count_),
+      A_(nv_ * nv_),
       B_(nv_ * nv_),
       C_(nv_ * nv_),
       D_(nv_ * nv_),
@@ -73,23 +74,52 @@ void LinearStages::linearise(double t, double h, const double* state,
                              const std::vector<double>& laws, const System::ZoneView& zone) {
     const int nv = nv_, n = n_, m = count_;
     if (!laws.empty()) expect_size("laws", laws.size(), static_cast<std::size_t>(m));
-    const auto rate_at = [&](double time, const double* x, double* out) {
-        system_.evaluate(time, x, zone);
-        system_.rate(out);
-    };
     // The rate of the memory is the one before the last correction, which stiff forces notice.
     system_.apply_laws(laws.empty() ? nullptr : laws.data());
-    rate_at(t, state, rate_.data());
+    rate_at(t, state, zone, rate_);
     laws_ = system_.law_values();
     applied_ = laws.empty() ? laws_ : laws;
+    system_.law_accelerations(W_.data());
     system_.apply_laws(m ? applied_.data() : nullptr);
+    std::vector<double> steps(n);
+    for (int j = 0; j < n; ++j)
+        steps[j] = rounded_down(constants_.difference * std::max(unit_[j], state_scale[j]));
     std::fill(delta_.begin(), delta_.end(), 0.0);
+    if (system_.derivatives(state, &rate_[nv], A_.data(), C_.data(), D_.data()))
+        by_forces(t, state, steps);
+    else
+        by_differences(t, state, steps, zone);
     for (int j = 0; j < n; ++j) {
-        const double step =
-            rounded_down(constants_.difference * std::max(unit_[j], state_scale[j]));
-        delta_[j] = step;
+        double* const column = j < nv ? &C_[j * nv] : &D_[(j - nv) * nv];
+        for (int k = 0; k < m; ++k)
+            if (L_[j * m + k] != 0.0) add(L_[j * m + k], &W_[k * nv], column, nv);
+    }
+    std::fill(by_time_.begin(), by_time_.end(), 0.0);
+    if (!system_.time_dependent()) return;
+    const double spacing =
+        std::nextafter(std::abs(t), std::numeric_limits<double>::infinity()) - std::abs(t);
+    const double tau = rounded_down(
+        std::max(constants_.time_difference * h, constants_.shortest_difference * spacing));
+    rate_at(t + tau, state, zone, probe_);
+    rate_at(t + 2.0 * tau, state, zone, other_);
+    for (int i = 0; i < n; ++i)
+        by_time_[i] = (4.0 * (probe_[i] - rate_[i]) - (other_[i] - rate_[i])) / (2.0 * tau);
+}
+
+void LinearStages::rate_at(double t, const double* state, const System::ZoneView& zone,
+                           std::vector<double>& out) {
+    system_.evaluate(t, state, zone);
+    system_.rate(out.data());
+}
+
+// B, C and D with the laws held, and L, from differences of rates.
+void LinearStages::by_differences(double t, const double* state, const std::vector<double>& steps,
+                                  const System::ZoneView& zone) {
+    const int nv = nv_, n = n_, m = count_;
+    for (int j = 0; j < n; ++j) {
+        const double step = delta_[j] = steps[j];
         system_.retract(state, delta_.data(), x_.data());
-        rate_at(t, x_.data(), probe_.data());
+        rate_at(t, x_.data(), zone, probe_);
         const bool position = j < nv;
         if (position) {
             system_.chart_rate(delta_.data(), probe_.data(), other_.data());
@@ -100,33 +130,47 @@ void LinearStages::linearise(double t, double h, const double* state,
         for (int k = 0; k < m; ++k) L_[j * m + k] = (system_.law_values()[k] - laws_[k]) / step;
         delta_[j] = 0.0;
     }
-    std::fill(by_time_.begin(), by_time_.end(), 0.0);
-    if (system_.time_dependent()) {
-        const double spacing =
-            std::nextafter(std::abs(t), std::numeric_limits<double>::infinity()) - std::abs(t);
-        const double tau = rounded_down(
-            std::max(constants_.time_difference * h, constants_.shortest_difference * spacing));
-        rate_at(t + tau, state, probe_.data());
-        rate_at(t + 2.0 * tau, state, other_.data());
-        for (int i = 0; i < n; ++i)
-            by_time_[i] =
-                (4.0 * (probe_[i] - rate_[i]) - (other_[i] - rate_[i])) / (2.0 * tau);
+}
+
+// The same where A, C and D are known with the forces held.
+void LinearStages::by_forces(double t, const double* state, const std::vector<double>& steps) {
+    const int nv = nv_, n = n_, m = count_;
+    double *const held = probe_.data(), *const forces = other_.data();
+    system_.applied_forces(t, state, held);
+    std::fill(L_.begin(), L_.end(), 0.0);
+    if (system_.separate_forces()) {
+        // Each law is that of one coordinate: all positions are moved at once, then all rates.
+        for (const int first : {0, nv}) {
+            std::copy_n(&steps[first], nv, &delta_[first]);
+            system_.retract(state, delta_.data(), x_.data());
+            system_.applied_forces(t, x_.data(), forces);
+            for (int i = 0; i < nv; ++i) {
+                const int k = system_.law_of_coordinate(i), j = first + i;
+                if (k >= 0) L_[j * m + k] = (system_.law_values()[k] - laws_[k]) / steps[j];
+                delta_[j] = 0.0;
+            }
+        }
+    } else {
+        for (int j = 0; j < n; ++j) {
+            delta_[j] = steps[j];
+            system_.retract(state, delta_.data(), x_.data());
+            system_.applied_forces(t, x_.data(), forces);
+            delta_[j] = 0.0;
+            double* const column = j < nv ? &C_[j * nv] : &D_[(j - nv) * nv];
+            for (int i = 0; i < nv; ++i)
+                if (forces[i] != held[i])
+                    add((forces[i] - held[i]) / steps[j], &A_[i * nv], column, nv);
+            for (int k = 0; k < m; ++k)
+                L_[j * m + k] = (system_.law_values()[k] - laws_[k]) / steps[j];
+        }
     }
-    // Accelerations are linear in the laws that act.
-    const double change = std::max(1.0, largest(applied_.data(), m));
-    for (int k = 0; k < m; ++k) {
-        const double before = applied_[k];
-        applied_[k] += change;
-        rate_at(t, state, probe_.data());
-        applied_[k] = before;
-        for (int i = 0; i < nv; ++i)
-            W_[k * nv + i] = (probe_[nv + i] - rate_[nv + i]) / change;
-    }
-    for (int j = 0; j < n; ++j) {
-        double* const column = j < nv ? &C_[j * nv] : &D_[(j - nv) * nv];
-        for (int k = 0; k < m; ++k)
-            if (L_[j * m + k] != 0.0) add(L_[j * m + k], &W_[k * nv], column, nv);
-    }
+    for (const GroupJoint& joint : system_.groups())
+        for (int j = joint.start; j < joint.start + joint.size; ++j) {
+            delta_[j] = steps[j];
+            system_.chart_rate(delta_.data(), rate_.data(), other_.data());
+            delta_[j] = 0.0;
+            for (int i = 0; i < nv; ++i) B_[j * nv + i] = (other_[i] - rate_[i]) / steps[j];
+        }
 }
 
 void LinearStages::factorise(double k) {

@@ -40,6 +40,11 @@ private:
     void linearise(double t, double h, const double* state,
                    const std::vector<double>& state_scale, const std::vector<double>& laws,
                    const System::ZoneView& zone);
+    void rate_at(double t, const double* state, const System::ZoneView& zone,
+                 std::vector<double>& out);
+    void by_differences(double t, const double* state, const std::vector<double>& steps,
+                        const System::ZoneView& zone);
+    void by_forces(double t, const double* state, const std::vector<double>& steps);
     void factorise(double k);
     void multiply(const std::vector<double>& x, std::vector<double>& out) const;  // J x
 
@@ -52,7 +57,7 @@ private:
     double known_time_ = 0.0, k_ = 0.0;
     std::vector<double> known_state_, known_rate_, known_laws_;
     std::vector<double> rate_, by_time_, applied_, laws_;
-    std::vector<double> B_, C_, D_;       // (nv, nv), column by column
+    std::vector<double> A_, B_, C_, D_;   // (nv, nv), column by column; A: accelerations by forces
     std::vector<double> L_;               // (m, n), of the laws by the chart coordinates
     std::vector<double> W_;               // (nv, m), of the accelerations by the laws
     std::vector<double> S_;               // (nv, nv), the blocks of joints that need a chart

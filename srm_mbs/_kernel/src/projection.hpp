@@ -40,7 +40,8 @@ public:
     virtual void multiplier(const double* white, double* g) const = 0;
     // Subtracts Q Q^T x from x, in place.
     virtual void remove_normal(double* white) const = 0;
-    // x = L^T x and x = L^-T x, in place.
+    // x = L^-1 x, x = L^T x and x = L^-T x, in place.
+    virtual void whiten_force(double* x) const = 0;
     virtual void whiten_velocity(double* x) const = 0;
     virtual void unwhiten(double* x) const = 0;
     // M-orthonormal normals L^-T Q (rank, nv), that of the smallest pivot last.

@@ -150,6 +150,14 @@ void SparseProjection::unwhiten(double* x) const {
     }
 }
 
+void SparseProjection::whiten_force(double* x) const {
+    for (int k = nv - 1; k >= 0; --k) {
+        const int first = ancestor_start_[k], n = ancestor_start_[k + 1] - first;
+        x[k] *= inverse_[k];
+        scattered(-x[k], L_.data() + first, ancestors_.data() + first, n, x);
+    }
+}
+
 void SparseProjection::whiten_velocity(double* x) const {
     for (int k = nv - 1; k >= 0; --k) {
         const int first = ancestor_start_[k], n = ancestor_start_[k + 1] - first;
@@ -159,12 +167,7 @@ void SparseProjection::whiten_velocity(double* x) const {
 
 // Computes W, gamma and the norms of the columns.
 void SparseProjection::whiten_columns(const double* bias) {
-    for (int k = nv - 1; k >= 0; --k) {
-        const int first = ancestor_start_[k], n = ancestor_start_[k + 1] - first;
-        white_force[k] *= inverse_[k];
-        scattered(-white_force[k], L_.data() + first, ancestors_.data() + first, n,
-                  white_force.data());
-    }
+    whiten_force(white_force.data());
     for (int j = 0; j < rows; ++j) {
         double* a = column(j);
         const int start = support_start_[j], end = support_start_[j + 1];

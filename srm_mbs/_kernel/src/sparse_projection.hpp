@@ -38,6 +38,7 @@ public:
     void normal(const double* g, double* white) const override;
     void multiplier(const double* white, double* g) const override;
     void remove_normal(double* white) const override;
+    void whiten_force(double* x) const override;
     void whiten_velocity(double* x) const override;
     void unwhiten(double* x) const override;
     void normals(double* out) const override;

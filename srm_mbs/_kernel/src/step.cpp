@@ -178,6 +178,16 @@ bool SplitStep::chatters(const IntegratorState& memory) const {
     return false;
 }
 
+// Error of the rate of a coordinate with friction that turns back within the step: the function of
+// that name in methods/stiffness.py.
+double SplitStep::reversal_error(const IntegratorState& memory, int i) const {
+    const double before = memory.rate[i], after = result.end_rate[i];
+    const double resolved = constants.unresolved * system_.friction_tolerance(i, 0.0);
+    if (!(before * after < 0.0 && std::abs(after - before) > resolved)) return 0.0;
+    const double jump = std::abs(result.end_rate[nv_ + i] - memory.rate[nv_ + i]);
+    return constants.reversal_share * h_ * jump;
+}
+
 // Takes the step into account, which was accepted: methods/stiffness.py.
 void SplitStep::count_stiffness(IntegratorState& memory) {
     if (!linear_) {
@@ -536,6 +546,8 @@ void SplitStep::estimate_error(const IntegratorState& memory, double sigma_chang
         error_[i] = h_ * std::abs(error_[i]);
         weights_[i] = norm.weight(i, std::max(memory.state_scale[i], r.state_scale[i]));
     }
+    for (int i = 0; system_.has_friction() && i < nv_; ++i)
+        error_[nv_ + i] = std::max(error_[nv_ + i], reversal_error(memory, i));
     for (int i = 0; linear_ && i < nv_; ++i)
         weights_[nv_ + i] =
             std::min(weights_[nv_ + i], system_.friction_tolerance(i, r.end_rate[i]));

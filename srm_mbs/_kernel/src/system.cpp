@@ -9,6 +9,7 @@
 #include <pinocchio/algorithm/joint-configuration.hpp>
 #include <pinocchio/algorithm/jacobian.hpp>
 #include <pinocchio/algorithm/kinematics.hpp>
+#include <pinocchio/algorithm/rnea-derivatives.hpp>
 #include <pinocchio/algorithm/rnea.hpp>
 
 #include "errors.hpp"
@@ -188,6 +189,7 @@ System::System(const void* model, SystemData data, Controller controller)
     nv = work_->model.nv;
     closed_ = data_.structural_rank > 0;
     flat_ = nq == nv;
+    between_links_ = std::any_of(data_.forces.begin(), data_.forces.end(), acts_between_links);
     if (closed_)
         projection_ = make_projection(data_.structural_rank, data_.sigma_ref, pattern(),
                                       // A joint that mimics another adds entries off the tree.
@@ -373,7 +375,91 @@ int System::resolve_laws() {
         for (std::size_t i = 0; i < factors->size(); ++i)
             if ((*factors)[i] != 0.0) passive[i] = true;
     laws_.resolve(data_.forces, passive);
-    return laws_.count();
+    lawful_.clear();
+    lawless_.clear();
+    joined_.clear();
+    if (!closed_ || laws_.count() <= nv - structural_rank()) return laws_.count();
+    for (const ForceElement& e : data_.forces)
+        (e.kind == ForceKind::wrench || e.kind == ForceKind::joint_torque ? lawless_ : lawful_)
+            .push_back(e);
+    if (lawful_.empty()) return laws_.count();
+    joined_.resize(nv);
+    laws_.join(nv);
+    return nv;
+}
+
+// The forces of joined laws, or what acts in their place, and those of the other elements.
+void System::joined_forces(double t, const double* q) {
+    auto& w = *work_;
+    for (int i = 0; i < nv; ++i) {
+        joined_[i] = data_.damping.empty() ? 0.0 : -data_.damping[i] * v_[i];
+        if (!data_.friction.empty())
+            joined_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
+    }
+    add_forces(lawful_, data_.coincident, w, t, q, v_.data(), bushings_, joined_.data(), nullptr);
+    add_forces(lawless_, data_.coincident, w, t, q, v_.data(), bushings_, f_.data(), nullptr);
+    const double* acting = laws_.applied ? laws_.applied : joined_.data();
+    for (int i = 0; i < nv; ++i) f_[i] += acting[i];
+}
+
+// What closures leave of them: M (1 - P) M^-1 times the forces.
+void System::joined_values() {
+    std::copy(joined_.begin(), joined_.end(), white_.begin());
+    projection_->whiten_force(white_.data());
+    projection_->remove_normal(white_.data());
+    projection_->unwhiten(white_.data());
+    mass_times(white_.data(), laws_.values.data());
+}
+
+void System::factorise_mass() {
+    factors_.resize(static_cast<std::size_t>(nv) * nv);
+    pivots_.resize(nv);
+    const auto& M = work_->data.M;  // the upper triangle
+    for (int j = 0; j < nv; ++j)
+        for (int i = 0; i <= j; ++i) factors_[j * nv + i] = factors_[i * nv + j] = M(i, j);
+    if (!lu_factor(factors_.data(), nv, pivots_.data()))
+        throw EvaluationError{Failure::acceleration};
+}
+
+void System::law_accelerations(double* out) {
+    const int m = laws_.count();
+    auto& w = *work_;
+    const double* const applied = laws_.applied;
+    std::vector<double> unit(m), none(nv), force(nv);
+    const auto forces_with = [&](std::vector<double>& tau) {
+        laws_.applied = unit.data();
+        add_forces(data_.forces, data_.coincident, w, 0.0, w.q.data(), v_.data(), bushings_,
+                   tau.data(), &laws_);
+    };
+    if (!closed_ && nv > one_pass_size) {
+        pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
+        factorise_mass();
+    }
+    if (joined_.empty()) forces_with(none);
+    for (int k = 0; k < m; ++k) {
+        std::fill(force.begin(), force.end(), 0.0);
+        unit[k] = 1.0;
+        if (joined_.empty()) {
+            forces_with(force);
+            for (int i = 0; i < nv; ++i)
+                force[i] += (laws_.of_coordinate(i) == k ? 1.0 : 0.0) - none[i];
+        } else {
+            force[k] = 1.0;
+        }
+        unit[k] = 0.0;
+        double* const a = out + static_cast<std::ptrdiff_t>(k) * nv;
+        if (closed_) {
+            projection_->whiten_force(force.data());
+            std::copy(force.begin(), force.end(), a);
+            projection_->unwhiten(a);
+            normal_part(a, force.data());
+            for (int i = 0; i < nv; ++i) a[i] -= force[i];
+        } else {
+            std::copy(force.begin(), force.end(), a);
+            lu_solve(factors_.data(), nv, pivots_.data(), a);
+        }
+    }
+    laws_.applied = applied;
 }
 
 // The laws of coordinates, as far as they are damping and friction; applied ones act.
@@ -451,16 +537,12 @@ void System::tree_terms(const double* state) {
         pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
 }
 
-void System::evaluate(double t, const double* state, const ZoneView& zone) {
-    ++evaluations;
-    t = std::min(std::max(t, first_), last_);
-    if (!(distance(state, nq + nv) < overflow)) throw EvaluationError{Failure::not_finite};
-    auto& w = *work_;
-    std::copy(state, state + nq, w.q.data());
-    std::copy(state + nq, state + nq + nv, w.v.data());
+// The velocities, and the forces along coordinates but those of elements.
+void System::coordinate_forces(double t, const double* state) {
     std::copy(state + nq, state + nq + nv, v_.begin());
     std::fill(f_.begin(), f_.end(), 0.0);
-    if (!data_.damping.empty() && !laws_.applied)
+    const bool joined = tracks_laws_ && !joined_.empty();
+    if (!data_.damping.empty() && !laws_.applied && !joined)
         for (int i = 0; i < nv; ++i) f_[i] = -data_.damping[i] * v_[i];
     if (controller_) {
         controller_(t, state, state + nq, acted_.data());
@@ -468,23 +550,75 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     }
     if (const double* force = held_force(t))
         for (int i = 0; i < nv; ++i) f_[i] += force[i];
-    if (!laws_.applied)
+    if (!laws_.applied && !joined)
         for (std::size_t i = 0; i < data_.friction.size(); ++i)
             f_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
+    if (tracks_laws_ && !joined) passive_forces();
+}
+
+void System::applied_forces(double t, const double* state, double* out) {
+    auto& w = *work_;
+    t = std::min(std::max(t, first_), last_);
+    coordinate_forces(t, state);
+    if (!data_.forces.empty()) {
+        if (between_links_) {
+            move_bodies(state);
+            pinocchio::computeJointJacobians(w.model, w.data);
+        }
+        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
+                   tracks_laws_ ? &laws_ : nullptr);
+    }
+    std::copy(f_.begin(), f_.end(), out);
+}
+
+// With ID the inverse dynamics, N the M-orthonormal normals of closures whose G is constant, and
+// A = M^-1 - N N^T: da = A (df - dID).
+bool System::derivatives(const double* state, const double* a, double* by_forces, double* by_q,
+                         double* by_v) {
+    using Matrix = Eigen::MatrixXd;
+    auto& w = *work_;
+    if (!data_.closures.empty() || !joined_.empty() || rank_deficient()) return false;
+    if (!w.model.mimicking_joints.empty() || !w.model.gravity.angular().isZero(0.0)) return false;
+    Matrix M = Matrix::Zero(nv, nv), dq(M), dv(M), N;
+    if (closed_) {
+        N.resize(nv, rank());
+        projection_->normals(N.data());
+    }
+    std::copy(state, state + nq, w.q.data());
+    std::copy(state + nq, state + nq + nv, w.v.data());
+    std::copy(a, a + nv, w.tau.data());
+    pinocchio::computeRNEADerivatives(w.model, w.data, Argument(w.q), Argument(w.v),
+                                      Argument(w.tau), Eigen::Ref<Matrix>(dq),
+                                      Eigen::Ref<Matrix>(dv), Eigen::Ref<Matrix>(M));
+    const Eigen::LLT<Matrix, Eigen::Upper> factors(M);
+    if (factors.info() != Eigen::Success) throw EvaluationError{Failure::acceleration};
+    Eigen::Map<Matrix> A(by_forces, nv, nv);
+    A.setIdentity();
+    factors.solveInPlace(A);
+    if (closed_) A.noalias() -= N * N.transpose();
+    Eigen::Map<Matrix>(by_q, nv, nv).noalias() = -A * dq;
+    Eigen::Map<Matrix>(by_v, nv, nv).noalias() = -A * dv;
+    return true;
+}
+
+void System::evaluate(double t, const double* state, const ZoneView& zone) {
+    ++evaluations;
+    t = std::min(std::max(t, first_), last_);
+    if (!(distance(state, nq + nv) < overflow)) throw EvaluationError{Failure::not_finite};
+    auto& w = *work_;
+    std::copy(state, state + nq, w.q.data());
+    std::copy(state + nq, state + nq + nv, w.v.data());
+    coordinate_forces(t, state);
     ForceLaws* const laws = tracks_laws_ ? &laws_ : nullptr;
-    if (laws) passive_forces();
+    const bool joined = laws && !joined_.empty();
     if (!closed_ && laws && nv <= one_pass_size) {
         // The one pass over the tree that closures have costs less than three.
         pinocchio_model::compute_terms(w);
         for (int i = 0; i < nv; ++i) rate_[i] = f_[i] - w.data.nle[i];
         add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, rate_.data(),
                        laws);
-        double M[one_pass_size * one_pass_size];
-        int pivots[one_pass_size];
-        for (int j = 0; j < nv; ++j)
-            for (int i = 0; i <= j; ++i) M[j * nv + i] = M[i * nv + j] = w.data.M(i, j);
-        if (!lu_factor(M, nv, pivots)) throw EvaluationError{Failure::acceleration};
-        lu_solve(M, nv, pivots, rate_.data());
+        factorise_mass();
+        lu_solve(factors_.data(), nv, pivots_.data(), rate_.data());
         if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
         return;
     }
@@ -503,13 +637,16 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     }
     pinocchio_model::compute_terms(w);
     for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
-    if (!data_.forces.empty())
+    if (joined)
+        joined_forces(t, state);
+    else if (!data_.forces.empty())
         add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
                    laws);
     update_closures(state, true);
     update_drives(t, true);
     Projection& p = *projection_;
     p.factor(w.data.M.data(), f_.data(), bias_.data(), zone.threshold);
+    if (joined) joined_values();
     predicted_ = false;
     if (!p.rank_deficient || zone.history == nullptr) return;
     predicted_ = zone.predicts && zone.history->predict_near(t, prediction_.data());

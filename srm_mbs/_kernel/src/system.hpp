@@ -209,7 +209,8 @@ public:
     int structural_rank() const { return data_.structural_rank; }
     bool driven() const { return !data_.drives.empty(); }
     // The laws of forces in linearly implicit steps: their number; their values, which evaluations
-    // find while they are tracked; what acts in their place, or, if null, they themselves.
+    // find while they are tracked; what acts in their place, or, if null, they themselves.  More
+    // laws than degrees of freedom are one: what closures leave of their generalised forces.
     int resolve_laws();
     void track_laws(bool tracked) {
         tracks_laws_ = tracked;
@@ -217,6 +218,19 @@ public:
     }
     void apply_laws(const double* values) { laws_.applied = values; }
     const std::vector<double>& law_values() const { return laws_.values; }
+    // Derivatives (nv, count) of the accelerations by the laws that act, at the stage evaluated last.
+    void law_accelerations(double* out);
+    // Number of the law of a coordinate, or -1.
+    int law_of_coordinate(int i) const { return laws_.of_coordinate(i); }
+    // At the stage evaluated last, with the accelerations a (nv,): their derivatives (nv, nv), column
+    // by column, by the forces, and by the chart coordinates while the forces are held.  False if
+    // only differences give them.  Other terms of the stage are lost.
+    bool derivatives(const double* state, const double* a, double* by_forces, double* by_q,
+                     double* by_v);
+    // All forces (nv,) but those of inertia, gravity and closures, and the values of the laws.
+    void applied_forces(double t, const double* state, double* out);
+    // Whether the laws, each of its own coordinate, are all that makes them depend on the state.
+    bool separate_forces() const { return !controller_ && !between_links_; }
     bool has_friction() const { return !data_.friction.empty(); }
     // Error of the rate v of a coordinate from which its friction is another; infinite without.
     double friction_tolerance(int i, double v) const;
@@ -244,14 +258,23 @@ private:
     double first_ = -std::numeric_limits<double>::infinity();
     double last_ = std::numeric_limits<double>::infinity();
     void passive_forces();
+    void coordinate_forces(double t, const double* state);
+    void joined_forces(double t, const double* q);
+    void joined_values();
+    void factorise_mass();
     ForceLaws laws_;
+    // Elements with laws, and the others, where the laws are joined.
+    std::vector<ForceElement> lawful_, lawless_;
+    std::vector<double> joined_;  // (nv,), generalised forces of joined laws; empty: they are not
+    std::vector<double> factors_;  // (nv, nv), of M of an open tree
+    std::vector<int> pivots_;
     bool tracks_laws_ = false;
     std::vector<double> held_from_, held_;  // times (s), and forces (k, nv)
     SystemData data_;
     Controller controller_;
     std::unique_ptr<pinocchio_model::Workspace> work_;
     std::unique_ptr<Projection> projection_;
-    bool closed_, flat_, predicted_ = false;
+    bool closed_, flat_, between_links_, predicted_ = false;
     std::vector<BushingStep> bushings_;  // in the step that is made
     std::vector<double> g_, bias_, pushed_, f_, v_, rate_, prediction_, white_, acted_;
 };

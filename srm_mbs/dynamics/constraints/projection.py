@@ -278,6 +278,11 @@ class Projection:
         out: FloatArray = self.Q.dot(self.Q.T.dot(white))
         return out if self.held is None else out + self.held @ (self.held.T @ white)
 
+    def tangential_force(self, f: FloatArray) -> FloatArray:
+        """M (1 - P) M^-1 f (nv,): what the rows in use leave of the forces f (nv,)."""
+        white = whiten(self.U, f)
+        return self.U.T @ (white - self.Q @ (self.Q.T @ white))
+
     def project(self, w: FloatArray) -> FloatArray:
         """P w (nv,)."""
         return self.unwhiten(self.white_project(w))

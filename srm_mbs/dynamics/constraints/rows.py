@@ -409,6 +409,11 @@ class LoopKinematics:
         other._allocate()
         return other
 
+    @property
+    def is_constant(self) -> bool:
+        """Whether G is constant: all rows are those of joint coordinates."""
+        return not self._anchored
+
     def pattern(self) -> BoolArray:
         """Which entries of G (m, nv) may differ from zero."""
         out: BoolArray = self._support != 0.0

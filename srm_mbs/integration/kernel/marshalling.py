@@ -97,6 +97,8 @@ def constants() -> Any:
         other_steps=stiffness.OTHER_STEPS,
         not_stiff=stiffness.NOT_STIFF,
         power_iterations=stiffness.POWER_ITERATIONS,
+        unresolved=stiffness.UNRESOLVED,
+        reversal_share=stiffness.REVERSAL_SHARE,
         difference=linear_split_step.DIFFERENCE,
         time_difference=linear_split_step.TIME_DIFFERENCE,
         shortest_difference=linear_split_step.SHORTEST_DIFFERENCE,

@@ -9,7 +9,12 @@ J = dD/d delta and D_t there, the rate of the stage i is
 
 (G. Steinebach, BIT Numer. Math. 63 (2023) 27; E. Hairer, G. Wanner, *Solving Ordinary Differential
 Equations II*, 2nd edition, Springer 1996, IV.7).  The order depends on J: it is found anew at every
-accepted state, by one-sided differences.
+accepted state.  The accelerations of a tree with closures of joint coordinates alone, whose G is
+constant, have derivatives in closed form: with the inverse dynamics ID(q, v, a) and the
+M-orthonormal normals N of the closures, da = (M^-1 - N N^T) (df - dID), where ID is differentiated
+by Pinocchio (J. Carpentier, N. Mansard, *Analytical derivatives of rigid body dynamics algorithms*,
+RSS 2018), and the forces f by one-sided differences.  Other systems are differentiated as a whole
+by such differences.
 
 **Laws of forces.**  Dampers, springs, bushings and friction act along directions N(q) that turn
 with the configuration: f = f_0(q, v, t) + N(q) y, y = F(q, v).  Evaluated at stages, a law of a
@@ -18,6 +23,8 @@ of its own: 0 = F(q, v) - y is linearised like the other equations (the same ref
 stages evaluate the forces with their own y, and what is nonlinear no longer contains c.  With
 L = dF/d delta and W = dD/dy the full J is that with y held, plus W L; what a stage's law lacks,
 r = F - y, adds W r to the right-hand side, and the rate of y is r / (h gamma) + L (K + w) - w_y.
+More laws than degrees of freedom are one, y = M (1 - P) M^-1 N F: closures take up the rest, which
+may grow with c.
 
 Everything else, the correction at the end, the zone and the placement, is that of explicit steps;
 only stages of motions that linger next to a singular configuration are not solved by nodes of the
@@ -75,26 +82,41 @@ def linearised(
     m = len(applied)
     system.apply_laws(applied if m else None)
     steps = rounded_down(DIFFERENCE * np.maximum(unit, memory.state_scale))
-    J, by_coordinates = np.empty((n, n)), np.empty((m, n))
+    # Accelerations are linear in what acts in place of the laws.
+    change = max(1.0, float(np.abs(applied).max(initial=0.0)))
+    J, by_coordinates, by_laws = np.zeros((n, n)), np.empty((m, n)), np.zeros((n, m))
+    known = system.derivatives(state, rate[k:])
+    held = rate[k:] if known is None else known.forces(t, state)
+
+    def probe(step: float, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """At ``x``, ``step`` away: the rate, except for what inertia, gravity and closures change
+        if that is known; the derivative of the accelerations; the laws."""
+        if known is None:
+            there, own = rate_at(t, x)
+            return there, (there[k:] - rate[k:]) / step, own
+        forces = known.forces(t, x)
+        there = np.concatenate([x[len(x) - k :], rate[k:]])
+        return there, known.by_forces @ ((forces - held) / step), system.laws
+
     for j, step in enumerate(steps.tolist()):
         delta = np.zeros(n)
         delta[j] = step
-        there, own = rate_at(t, system.retract(state, delta))
-        J[:, j] = (system.chart_rate(delta, there) - rate) / step
+        there, J[k:, j], own = probe(step, system.retract(state, delta))
+        J[:k, j] = (system.chart_rate(delta, there) - rate)[:k] / step
         by_coordinates[:, j] = (own - laws) / step
+    if known is not None:
+        J[k:] += np.hstack([known.by_positions, known.by_velocities])
+    for i in range(m):
+        system.apply_laws(applied + change * (np.arange(m) == i))
+        by_laws[k:, i] = probe(change, state)[1]
+    system.apply_laws(applied if m else None)
+    J += by_laws @ by_coordinates
     by_time = np.zeros(n)
     if system.time_dependent:
         shortest = SHORTEST_DIFFERENCE * np.spacing(abs(t))
         tau = float(rounded_down(np.array(max(TIME_DIFFERENCE * h, shortest))))
         first, second = (rate_at(t + i * tau, state)[0] - rate for i in (1.0, 2.0))
         by_time = (4.0 * first - second) / (2.0 * tau)
-    # Accelerations are linear in what acts in place of the laws.
-    change = max(1.0, float(np.abs(applied).max(initial=0.0)))
-    by_laws = np.zeros((n, m))
-    for i in range(m):
-        system.apply_laws(applied + change * (np.arange(m) == i))
-        by_laws[k:, i] = (rate_at(t, state)[0] - rate)[k:] / change
-    J += by_laws @ by_coordinates
     return Linearisation(rate, J, by_time, applied, laws, by_coordinates, by_laws)
 
 

@@ -36,7 +36,12 @@ from srm_mbs.integration.methods.near_singular import (
     WATCHED_SIGMA,
     BranchStages,
 )
-from srm_mbs.integration.methods.stiffness import chatters, count_stiffness, stiffness_of
+from srm_mbs.integration.methods.stiffness import (
+    chatters,
+    count_stiffness,
+    reversal_error,
+    stiffness_of,
+)
 
 RESIDUAL_EVERY = 16
 """Steps, after the first RESIDUAL_EVERY, from one look at all closure rows to the next."""
@@ -208,8 +213,13 @@ class SplitStep:
         if scheme.error is not None:
             error = h * (scheme.error @ rates)
             weights = norm.weights(np.maximum(memory.state_scale, state_scale))
+            k = system.multiplier_part.start
+            speeds = system.friction_tolerance(np.zeros(k))[k:]
+            if np.isfinite(speeds).any():
+                ends = np.array([memory.rate, end_rate])
+                unseen = reversal_error(h, ends[:, :k], ends[:, k:], speeds)
+                error[k:] = np.maximum(np.abs(error[k:]), unseen)
             if scheme.implicit is not None:
-                k = system.multiplier_part.start
                 weights = np.minimum(weights, system.friction_tolerance(end_rate[:k]))
             if branch is not None and history is not None:
                 if deficient and sigma_change > UNCERTAINTY_SIGMA_CHANGE:

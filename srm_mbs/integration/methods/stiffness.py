@@ -27,6 +27,11 @@ OTHER_STEPS = 6
 NOT_STIFF = 2.0
 """h |lambda| of a linearly implicit step up to which an explicit one would do: it is stable for
 three times as long a step."""
+UNRESOLVED = 10.0
+"""Change of a rate over a step, in friction speeds, from which its stages miss the change of the
+friction."""
+REVERSAL_SHARE = 0.1
+"""Error of a quadrature with some ten nodes across a jump, over the step times the jump."""
 POWER_ITERATIONS = 6
 """Products with the linearised equations that estimate their largest eigenvalue."""
 
@@ -65,6 +70,27 @@ def chatters(
         return False
     change = h * np.ptp(accelerations, axis=0)
     return bool((change > np.maximum(np.abs(v).max(axis=0), weights))[rubs].any())
+
+
+def reversal_error(
+    h: float, rates: FloatArray, accelerations: FloatArray, speeds: FloatArray
+) -> FloatArray:
+    """Errors (k,) of the rates of coordinates with friction that turn back within a step of ``h``
+    (s) whose stages do not resolve that; 0 for others.
+
+    The acceleration then jumps within the step, and an embedded pair, which takes it for smooth,
+    finds the error of that by chance only.
+
+    Parameters
+    ----------
+    rates, accelerations : (2, k)
+        At the ends of the step.
+    speeds : (k,)
+        Rates within which the friction changes its sign; infinite where there is none.
+    """
+    turned = (rates[0] * rates[1] < 0.0) & (np.abs(rates[1] - rates[0]) > UNRESOLVED * speeds)
+    jump = np.abs(accelerations[1] - accelerations[0])
+    return np.where(turned, REVERSAL_SHARE * h * jump, 0.0)
 
 
 def count_stiffness(memory: IntegratorState, stiffness: float, scheme: ButcherTableau) -> None:

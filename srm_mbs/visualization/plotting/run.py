@@ -16,6 +16,7 @@ from srm_mbs.visualization.plotting.figure import (
     GREEN,
     GREY,
     LARGE_DOTS,
+    ORANGE,
     PURPLE,
     VERMILION,
     Draw,
@@ -144,6 +145,9 @@ def _draw_markers(
 def _step_sizes(axes: Axes, solution: Run, kinds: bool) -> str:
     steps = solution.steps
     mark_times(axes, solution, labelled=not kinds)
+    for number, (start, end) in enumerate(steps.stiff_intervals):
+        label = None if number else "stiff"
+        axes.axvspan(start, end, color=ORANGE, alpha=0.15, linewidth=0.0, label=label)
     starts, lengths = steps.times[:-1], np.diff(steps.times)
     _draw_markers(axes, starts, lengths, "accepted", dots(BLUE, steps.count))
     if kinds:

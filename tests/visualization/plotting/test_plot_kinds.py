@@ -400,6 +400,17 @@ def test_rejected_steps_have_error_estimates_above_one() -> None:
     assert line(errors, "accepted").get_ydata().max() <= 1.0
 
 
+def test_stiff_intervals_are_shaded() -> None:
+    run = srm.simulate(srm.load("flyball_governor"), 0.1)
+    ((start, end),) = run.settings.stiff
+    axes = run.plot(kind="sigma").axes[-2]
+    (shaded,) = [patch for patch in axes.patches if patch.get_label() == "stiff"]
+    box = shaded.get_extents().transformed(axes.transData.inverted())
+    np.testing.assert_allclose([box.x0, box.x1], [start, end], rtol=1e-9)
+    plain = srm.simulate(srm.load("four_bar"), 0.1).plot(kind="sigma")
+    assert not any(axes.patches for axes in plain.axes)
+
+
 def test_steps_in_the_zone_are_marked() -> None:
     quarter = 4.29657624142677449 / 4.0  # a grid point is singular
     options: dict[str, Any] = {"tableau": "dopr54", "placement": "off"}

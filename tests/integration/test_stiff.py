@@ -21,7 +21,7 @@ from srm_mbs.integration.methods.tableaus import get_tableau
 from tests.support.commands import run as command
 from tests.support.convergence import fitted_order, observed_order, turning
 from tests.support.mechanisms import floating_ring
-from tests.support.reduced import slider_crank
+from tests.support.reduced import regular_slider_crank, slider_crank
 from tests.support.stiff import (
     bushed_four_bar,
     bushed_reference,
@@ -289,6 +289,32 @@ def test_friction_that_changes_its_direction_is_resolved(backend: str) -> None:
     assert len(found) == 2
     np.testing.assert_allclose(found, reference.t_events[0][1:], rtol=0.0, atol=1e-5)
     np.testing.assert_allclose(end_of(run), reference.y[:, -1], rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
+def test_errors_of_runs_with_friction_are_within_ten_tolerances(rtol: float) -> None:
+    """The crank of a slider-crank turns back until it rests, v_s = 1e-5, against Radau on the
+    reduced equation."""
+    F, speed = 5.0, 1e-5
+    mechanism = rubbing("slider_crank_regular", F, speed)
+    model = mechanism.model.copy()
+    model.friction = np.where(np.arange(model.nv) == 0, F, 0.0)
+    field = regular_slider_crank(lambda rate: -F * float(np.tanh(rate / speed)))
+    times = np.linspace(0.2, 10.0, 50)
+    expected = by_radau(field, [mechanism.q0[0], mechanism.v0[0]], times)
+    run = srm.simulate(replace(mechanism, model=model), 10.0, rtol=rtol)
+    assert run.settings.stiff
+    assert abs(run(times)[0][:, 0] - expected[:, 0]).max() < 10.0 * rtol
+
+
+@pytest.mark.parametrize("friction", [0.5, 2.0])
+def test_four_bars_with_friction_converge_with_the_tolerance(friction: float) -> None:
+    mechanism = rubbing("four_bar", friction, 1e-5)
+    times = np.linspace(0.2, 10.0, 50)
+    expected = srm.simulate(mechanism, 10.0, rtol=1e-10, tableau="rodas5p")(times)[0]
+    for rtol in (1e-5, 1e-6, 1e-7):
+        run = srm.simulate(mechanism, 10.0, rtol=rtol)
+        assert abs(run(times)[0] - expected).max() < 15.0 * rtol
 
 
 # Both backends

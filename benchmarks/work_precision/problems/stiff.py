@@ -20,7 +20,7 @@ from tests.support.stiff import bushed_field, bushed_four_bar
 
 TIME_CONSTANT = 1e-6
 """Of the bushing (s)."""
-FRICTION, FRICTION_SPEED = 2.0, 1e-5
+FRICTION, FRICTION_SPEED = 5.0, 1e-5
 """Torque of the friction in the crank's joint (N m), and the rate (rad/s) of its tanh."""
 STIFFNESS, DAMPING, REST = 8e5, 4e4, 0.5
 """Spring-dampers of the governor: N/m, N s/m, m."""

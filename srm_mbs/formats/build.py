@@ -42,7 +42,10 @@ log = get_logger(__name__)
 
 def _acting_joints(description: Description) -> Iterator[tuple[str, str]]:
     """Keys of the elements that act on joints, and the names of these."""
-    for kind, key in (("force", "joint"), ("loop", "joints"), ("drive", "joint")):
+    for kind, key in (
+        *(("force", "joint"), ("force", "joints")),
+        *(("loop", "joints"), ("drive", "joint")),
+    ):
         for i, entry in enumerate(getattr(description, kind)):
             names = getattr(entry, key, None) or ()
             for name in [names] if isinstance(names, str) else names:
@@ -145,7 +148,9 @@ def _with_massless_ends(
             f"bodies without inertia at moving ends have {mass:g} kg and {inertia:g} kg m^2 "
             f"(massless): those of {', '.join(map(repr, names))}",
         )
-    coupled = sorted(description.coupled_joints().intersection(names))
+    coupled = sorted(
+        {name for entry in description.loop for name in entry.joints or ()}.intersection(names)
+    )
     left_out = f", and their couplings left out: {', '.join(map(repr, coupled))}" if coupled else ""
     return description.with_locked(names), (
         'joints that move nothing with inertia are locked (massless = "fix"): '

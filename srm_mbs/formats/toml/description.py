@@ -79,8 +79,9 @@ class Description(TopEntry):
                 )
 
     def coupled_joints(self) -> frozenset[str]:
-        """Names of the joints that take part in a coupling."""
-        return frozenset(name for entry in self.loop for name in entry.joints or ())
+        """Names of the joints that take part in a coupling, or in a spring on several joints."""
+        together = [*self.loop, *(entry for entry in self.force if hasattr(entry, "joints"))]
+        return frozenset(name for entry in together for name in entry.joints or ())
 
     def with_locked(self, joints: Collection[str]) -> Self:
         """The same description with ``joints`` locked as well, and without their couplings."""

@@ -30,6 +30,12 @@ JOINT_TYPES = ("hinge", "slide", "ball", "free")
 MOST_REPLICATED = 2000
 """Number of elements that the replicates of a file add: a line of text makes no more than some
 hundred bodies, which load in two seconds."""
+REFUSED = {
+    "flexcomp": "a deformable body",
+    "composite": "a chain or net of bodies",
+    "attach": "a part of another model",
+}
+"""Elements of a body that are refused, and what they are."""
 FLAGS = {"stiffness": "spring", "damping": "damper", "friction": "frictionloss"}
 """Properties of a joint, and the flags that switch them off."""
 _LINEAR, _ANGULAR = np.eye(6)[:3], np.eye(6)[3:]
@@ -132,6 +138,9 @@ class BodyReader:
         """Read the elements of a body or of a ``<frame>``; geoms and inertials into ``found``."""
         values = self.values
         where = f"body {name!r}"
+        for tag, what in REFUSED.items():
+            if node.find(tag) is not None:
+                raise values.fault(where, f"<{tag}> ({what}) is not read", "Remove it")
         many = ("geom", "site", "body", "frame", "joint", "replicate")
         values.children(node, where, BODY_READ, BODY_IGNORED, many)
         for child in node:

@@ -138,6 +138,8 @@ FAULTS = {
     "replicate without count": (JOINT, JOINT + '<replicate><geom size="1"/></replicate>'),
     "replicates": (JOINT, JOINT + '<replicate count="999">' * 3 + "</replicate>" * 3),
     "composite": (JOINT, JOINT + "<composite/>"),
+    "flexcomp": (JOINT, JOINT + "<flexcomp/>"),
+    "attach": (JOINT, JOINT + '<attach model="arm"/>'),
     "global": ("<worldbody>", '<compiler coordinate="global"/><worldbody>'),
     "order": ("<worldbody>", '<compiler eulerseq="xyw"/><worldbody>'),
     "angle": ("<worldbody>", '<compiler angle="grad"/><worldbody>'),

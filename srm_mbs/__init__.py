@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from srm_mbs.model.forces import (
         FORCE_TYPES,
         Bushing,
+        CouplingSpring,
         ForceElement,
         JointTorque,
         LimitSpring,
@@ -86,8 +87,8 @@ _NAMES = {
     "model.closures": "CLOSURE_TYPES LoopClosure",
     "model.dae": "SemiExplicitDAE",
     "model.drives": "Drive",
-    "model.forces": "Bushing FORCE_TYPES ForceElement JointTorque LimitSpring SpringDamper "
-    "TorsionSpring UserForce Wrench",
+    "model.forces": "Bushing CouplingSpring FORCE_TYPES ForceElement JointTorque LimitSpring "
+    "SpringDamper TorsionSpring UserForce Wrench",
     "model.laws": "ConstantSpeed LAW_TYPES MinimumJerk Polynomial Sine Table",
     "model.pinocchio_constraints": "closures_from_pinocchio",
     "simulation.energy_balance": "EnergyBalance",
@@ -119,6 +120,7 @@ __all__ = [
     "ButcherTableau",
     "Certificate",
     "ConstantSpeed",
+    "CouplingSpring",
     "DaeSolution",
     "Drive",
     "EnergyBalance",

@@ -225,6 +225,8 @@ def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
                 places.append(_anchor(value))
             elif key.name == "joint":
                 places.append(value)
+            elif key.name == "joints":
+                places += value
             elif key.name != "name":
                 if value is None:
                     continue

@@ -31,7 +31,7 @@ from srm_mbs.model.mechanism import MechanismData, per_model
 
 CONSTRAINT_TOLERANCE = 1e-12
 """Largest closure error of an assembled state, in rad and in scene diagonals."""
-AXES_TOLERANCE = 1e-6
+AXES_TOLERANCE = 1e-2
 """Largest mismatch of an assembled state: larger ones have axes in the opposite sense."""
 RANK_TOLERANCE = 1e-10
 """Relative singular value below which a direction does not move the closures."""

@@ -31,13 +31,16 @@ from srm_mbs.cli.output import (
     HTML_SUFFIXES,
     RUN_FAILED,
     AllowOutside,
+    ClosingTolerance,
     Html,
     Keyframe,
     Lines,
+    Massless,
     Model,
     check_output,
     echo,
     flush_output,
+    massless_ends,
     option,
     reported,
     say,
@@ -170,6 +173,8 @@ def simulate(
     live: playback.Live = False,
     allow_outside: AllowOutside = False,
     keyframe: Keyframe = None,
+    massless: Massless = None,
+    closing_tolerance: ClosingTolerance = None,
 ) -> None:
     """Simulate a mechanism and print a summary of the run.
 
@@ -188,7 +193,13 @@ def simulate(
     check_output(html, "--html", HTML_SUFFIXES)
     playback.check_pictures(image, at, video)
 
-    mechanism = srm_mbs.load(model, allow_outside=allow_outside, keyframe=keyframe)
+    mechanism = srm_mbs.load(
+        model,
+        allow_outside=allow_outside,
+        keyframe=keyframe,
+        massless=massless_ends(massless),
+        closing_tolerance=closing_tolerance,
+    )
     overlays = playback.overlay_options(mechanism, trace, gaps, reactions)
     playback.check_overlays(trace, gaps, reactions, (html, image, video, play, live))
     if full_paths and out is None:
@@ -253,11 +264,21 @@ def convert(
     cut: Annotated[list[str] | None, several("--cut", "JOINT", "Cut a loop at this joint.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
     allow_outside: AllowOutside = False,
+    massless: Massless = None,
+    closing_tolerance: ClosingTolerance = None,
 ) -> None:
     """Write a file of any format as a TOML description and a URDF."""
     from srm_mbs.formats.convert import convert as write
 
-    *written, notes = write(model, out, cut=cut or (), force=force, allow_outside=allow_outside)
+    *written, notes = write(
+        model,
+        out,
+        cut=cut or (),
+        force=force,
+        allow_outside=allow_outside,
+        massless=massless_ends(massless),
+        closing_tolerance=closing_tolerance,
+    )
     for path in written:
         say_written(path)
     for note in notes:
@@ -266,7 +287,13 @@ def convert(
 
 @app.command()
 @reported
-def info(model: Model, allow_outside: AllowOutside = False, keyframe: Keyframe = None) -> None:
+def info(
+    model: Model,
+    allow_outside: AllowOutside = False,
+    keyframe: Keyframe = None,
+    massless: Massless = None,
+    closing_tolerance: ClosingTolerance = None,
+) -> None:
     """Describe a mechanism: joints, loops, forces, the start, what is stiff.
 
     With its degrees of freedom, the rank of its closure rows, and the rows that are redundant.  Of
@@ -289,7 +316,13 @@ def info(model: Model, allow_outside: AllowOutside = False, keyframe: Keyframe =
         echo("")
         mechanism = solution.mechanism
     else:
-        mechanism = srm_mbs.load(model, allow_outside=allow_outside, keyframe=keyframe)
+        mechanism = srm_mbs.load(
+            model,
+            allow_outside=allow_outside,
+            keyframe=keyframe,
+            massless=massless_ends(massless),
+            closing_tolerance=closing_tolerance,
+        )
     table(mechanism_rows(mechanism))
     for header, rows in (
         (("joint", "type", "initial position", "initial rate"), joint_rows(mechanism)),

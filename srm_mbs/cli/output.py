@@ -64,7 +64,44 @@ Keyframe = Annotated[
     str | None,
     typer.Option("--keyframe", metavar="NAME", help="Start in this keyframe of an MJCF file."),
 ]
+Massless = Annotated[
+    str | None,
+    option(
+        "fix|MASS,INERTIA",
+        "Moving ends without inertia: lock their joints, or give their links this inertia "
+        "(kg, kg m^2).",
+    ),
+]
+ClosingTolerance = Annotated[
+    float | None,
+    option(
+        "S",
+        "Accuracy (m, rad) of the data of overconstrained loops that do not close exactly: rows "
+        "implied to it are left out.",
+    ),
+]
 HTML_SUFFIXES = (".html", ".htm")
+
+
+def massless_ends(given: str | None) -> str | dict[str, float] | None:
+    """``--massless`` as ``srm_mbs.load`` takes it.
+
+    Raises
+    ------
+    InputError
+        If it is neither ``fix`` nor two numbers.
+    """
+    if given is None or given == "fix":
+        return given
+    try:
+        mass, inertia = map(float, given.split(","))
+    except ValueError as error:
+        raise InputError(
+            f"{given!r} is neither fix nor two numbers",
+            element="massless",
+            remedy="Give fix, or mass and moment of inertia as 0.1,1e-4 (kg, kg m^2)",
+        ) from error
+    return {"mass": mass, "inertia": inertia}
 
 
 def say(kind: str, text: object) -> None:

@@ -9,7 +9,7 @@ with J the world-frame joint Jacobian; all elements between bodies are reduced t
 are spatial, in world axes at the world origin; that of a point p is v_lin + w x p.
 
 Each element of :mod:`srm_mbs.model.forces` has an :class:`Evaluator`: first those between links
-(springs, wrenches, bushings), then those on one joint (torques, springs, limits), then functions of
+(springs, wrenches, bushings), then those on joints (torques, springs, limits), then functions of
 the user.  :class:`ForceKinematics` has all elements of a mechanism.
 
 The rotation vector of a bushing, and with it its moment, jumps to the opposite at half a turn.  In
@@ -42,6 +42,7 @@ from srm_mbs.errors import EvaluationError
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.forces import (
     Bushing,
+    CouplingSpring,
     ForceElement,
     JointTorque,
     LimitSpring,
@@ -96,13 +97,20 @@ class Evaluator(ABC):
 
 
 class LawEvaluator(Evaluator):
-    """An element between links with laws: forces and moments, each along its own direction."""
+    """An element between links, or on several joints, with laws: forces and moments, each along
+    its own direction."""
 
     law_count: int
     """Number of its laws."""
 
     @abstractmethod
-    def laws(self, data: pin.Data, step: BushingStep | None = None) -> FloatArray:
+    def laws(
+        self,
+        data: pin.Data,
+        q: FloatArray,
+        v: FloatArray,
+        step: BushingStep | None = None,
+    ) -> FloatArray:
         """Values (law_count,) of its laws; ``step``: that of a bushing to which the stage
         belongs."""
 
@@ -197,7 +205,13 @@ class SpringDamperEvaluator(LawEvaluator):
         force, at_a, _ = self._force(data)
         add_wrench(tau, data, self.support, force, np.zeros(3), at_a)
 
-    def laws(self, data: pin.Data, step: BushingStep | None = None) -> FloatArray:
+    def laws(
+        self,
+        data: pin.Data,
+        q: FloatArray,
+        v: FloatArray,
+        step: BushingStep | None = None,
+    ) -> FloatArray:
         """The force along the line."""
         if not self.law_count:
             return np.zeros(0)
@@ -338,7 +352,13 @@ class BushingEvaluator(LawEvaluator):
         """See :class:`Evaluator`; ``step``: to which the stage belongs."""
         self._act(tau, data, *self._forces(data, step))
 
-    def laws(self, data: pin.Data, step: BushingStep | None = None) -> FloatArray:
+    def laws(
+        self,
+        data: pin.Data,
+        q: FloatArray,
+        v: FloatArray,
+        step: BushingStep | None = None,
+    ) -> FloatArray:
         """The forces and moments that are not always zero, with the opposite sign."""
         force, moment, _ = self._forces(data, step)
         return np.concatenate([force, moment])[self._own]
@@ -545,6 +565,63 @@ class TorsionSpringEvaluator(Evaluator):
         }
 
 
+class CouplingSpringEvaluator(LawEvaluator):
+    """A :class:`~srm_mbs.model.forces.CouplingSpring`, resolved against a model."""
+
+    law_count = 1
+
+    def __init__(self, model: pin.Model, force: CouplingSpring) -> None:
+        joints = [model.joints[model.getJointId(name)] for name in force.joints]
+        # In the order of the velocities, as the kernel has them.
+        order = np.argsort([joint.idx_v for joint in joints])
+        self.in_q = np.array([joints[k].idx_q for k in order])
+        self.in_v = np.array([joints[k].idx_v for k in order])
+        self.coefficients = np.array(force.coefficients)[order]
+        self.size = model.nv
+        self.stiffness, self.damping, self.rest = force.stiffness, force.damping, force.rest
+
+    def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        self.apply(tau, data, self.laws(data, q, v))
+
+    def laws(
+        self,
+        data: pin.Data,
+        q: FloatArray,
+        v: FloatArray,
+        step: BushingStep | None = None,
+    ) -> FloatArray:
+        """The force on the sum."""
+        rate = self.coefficients @ v[self.in_v]
+        return np.array([-(self.stiffness * self._stretch(q) + self.damping * rate)])
+
+    def apply(
+        self,
+        tau: FloatArray,
+        data: pin.Data,
+        values: FloatArray,
+        step: BushingStep | None = None,
+    ) -> None:
+        tau[self.in_v] += values[0] * self.coefficients
+
+    def _stretch(self, q: FloatArray) -> float:
+        return float(self.coefficients @ q[self.in_q]) - self.rest
+
+    def energy(self, data: pin.Data, q: FloatArray) -> float:
+        return 0.5 * self.stiffness * self._stretch(q) ** 2
+
+    def constants(self) -> dict[str, Any]:
+        along = np.zeros(self.size)
+        along[self.in_v] = self.coefficients
+        return {
+            "kind": 6,
+            "support": along,
+            "positions": self.in_q.tolist(),
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "rest": self.rest,
+        }
+
+
 class LimitSpringEvaluator(Evaluator):
     """A :class:`~srm_mbs.model.forces.LimitSpring`, resolved against a model."""
 
@@ -614,6 +691,7 @@ _EVALUATORS = {
     Wrench: WrenchEvaluator,
     Bushing: BushingEvaluator,
     LimitSpring: LimitSpringEvaluator,
+    CouplingSpring: CouplingSpringEvaluator,
     UserForce: _UserForceEvaluator,
 }
 
@@ -772,7 +850,7 @@ class ForceKinematics:
             if isinstance(element, TorsionSpringEvaluator | LimitSpringEvaluator):
                 element.add(along, data, q, v, 0.0)
         between = [e for e in self._elements if isinstance(e, LawEvaluator)]
-        return along, [e.laws(data, step.get(e)) for e in between]
+        return along, [e.laws(data, q, v, step.get(e)) for e in between]
 
     def of_laws(
         self,

@@ -15,6 +15,7 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.assembly.assemble import assemble
+from srm_mbs.assembly.implied_rows import without_implied_rows
 from srm_mbs.assembly.position import limit_springs
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import (
@@ -33,14 +34,17 @@ from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.coordinates import write_position, write_rate
 from srm_mbs.model.forces import ForceElement, Wrench
 from srm_mbs.model.mechanism import SimulationDefaults, Source
-from srm_mbs.model.validation import check_inertia, undetermined_joint
+from srm_mbs.model.validation import check_inertia, massless_ends, undetermined_joint
 
 log = get_logger(__name__)
 
 
 def _acting_joints(description: Description) -> Iterator[tuple[str, str]]:
     """Keys of the elements that act on joints, and the names of these."""
-    for kind, key in (("force", "joint"), ("loop", "joints"), ("drive", "joint")):
+    for kind, key in (
+        *(("force", "joint"), ("force", "joints")),
+        *(("loop", "joints"), ("drive", "joint")),
+    ):
         for i, entry in enumerate(getattr(description, kind)):
             names = getattr(entry, key, None) or ()
             for name in [names] if isinstance(names, str) else names:
@@ -125,6 +129,34 @@ def _without_locked(
     return lock_joints(model, list(description.lock), frozen), q, v, guess
 
 
+def _with_massless_ends(
+    description: Description, model: pin.Model
+) -> tuple[Description, tuple[str, ...]]:
+    """Treat massless moving ends as the description says: lock their joints, or give their bodies
+    the inertia of a ball in ``model``; returns the description and notes."""
+    treatment = description.massless
+    ends = [k for k in massless_ends(model) if model.names[k] not in description.lock]
+    if treatment == "refused" or not ends:
+        return description, ()
+    names = [str(model.names[k]) for k in ends]
+    if not isinstance(treatment, str):
+        mass, inertia = treatment["mass"], treatment["inertia"]
+        for joint in ends:
+            model.inertias[joint] = pin.Inertia(mass, np.zeros(3), inertia * np.eye(3))
+        return description, (
+            f"bodies without inertia at moving ends have {mass:g} kg and {inertia:g} kg m^2 "
+            f"(massless): those of {', '.join(map(repr, names))}",
+        )
+    coupled = sorted(
+        {name for entry in description.loop for name in entry.joints or ()}.intersection(names)
+    )
+    left_out = f", and their couplings left out: {', '.join(map(repr, coupled))}" if coupled else ""
+    return description.with_locked(names), (
+        'joints that move nothing with inertia are locked (massless = "fix"): '
+        f"{', '.join(map(repr, names))}{left_out}",
+    )
+
+
 def _friction_note(model: pin.Model, friction_speed: float) -> tuple[str, ...]:
     if not model.friction.any():
         return ()
@@ -174,6 +206,7 @@ def unassembled(
         reading.tree, source.urdf_path, source.base, description.lock, description.coupled_joints()
     )
     built.model.gravity.linear = np.array(source.gravity)
+    description, massless = _with_massless_ends(description, built.model)
     _check_joint_names(description, built.model)
     model, q, v, guess = _without_locked(description, built.model)
     check_inertia(model, source.urdf_path)
@@ -202,7 +235,12 @@ def unassembled(
         name=description.name or model.name,
         source=source,
         defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
-        notes=(*reading.notes, *built.notes, *_friction_note(model, friction_speed)),
+        notes=(
+            *reading.notes,
+            *built.notes,
+            *massless,
+            *_friction_note(model, friction_speed),
+        ),
     )
     if description.limits == "spring":
         mechanism = _with_limit_springs(mechanism)
@@ -308,6 +346,33 @@ def _with_rotors(mechanism: Mechanism) -> Mechanism:
     return replace(mechanism, model=model, notes=(*mechanism.notes, note))
 
 
+ALMOST_CLOSED = 1e-5
+"""Gap (m, rad) of loops below which the digits of the file may be the reason."""
+
+
+def _advice(error: AssemblyError) -> str:
+    """A further remedy for loops that almost close."""
+    gaps = [size for pair in error.residuals.values() for size in pair if size is not None]
+    if not max(gaps, default=np.inf) < ALMOST_CLOSED:
+        return ""
+    return (
+        f". Loops that are overconstrained and close to {max(gaps):.1e} (m, rad), the accuracy of "
+        "their file, load with closing_tolerance of that size (--closing-tolerance)"
+    )
+
+
+def _closed(mechanism: Mechanism, q: dict[str, Any], v: dict[str, Any]) -> Mechanism:
+    """The mechanism in the state that assembly finds, analysed there."""
+    # Assembly analyses this copy where its loops are closed, at rest.
+    guess = copy(mechanism)
+    state = assemble(guess, q, v)
+    if np.array_equal(state.v, guess.v0):
+        mechanism = guess
+    mechanism = mechanism.with_state(state.q, state.v)
+    _ = mechanism.structure
+    return mechanism
+
+
 def assembled(reading: Reading) -> Mechanism:
     """The mechanism with its loops closed.
 
@@ -319,14 +384,18 @@ def assembled(reading: Reading) -> Mechanism:
     description, source = reading.description, reading.source
     description.refuse_identical_closures()
     mechanism, q, v = unassembled(reading)
-    # Assembly analyses this copy where its loops are closed, at rest.
-    guess = copy(mechanism)
     try:
-        state = assemble(guess, q, v)
-        if np.array_equal(state.v, guess.v0):
-            mechanism = guess
-        mechanism = mechanism.with_state(state.q, state.v)
-        _ = mechanism.structure
+        try:
+            mechanism = _closed(mechanism, q, v)
+        except AssemblyError as error:
+            tolerance = description.closing_tolerance
+            if not error.residuals or error.held or error.limits:
+                raise
+            if not tolerance:
+                error.remedy += _advice(error)
+                raise
+            reduced, note = without_implied_rows(mechanism, tolerance, error)
+            mechanism = _closed(replace(reduced, notes=(*reduced.notes, note)), q, v)
     except AssemblyError as error:
         if description.lock:
             locked = ", ".join(map(repr, description.lock))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,8 @@ def convert(
     force: bool = False,
     mesh_dirs: Sequence[str | Path] = (),
     allow_outside: bool = False,
+    massless: str | Mapping[str, float] | None = None,
+    closing_tolerance: float | None = None,
 ) -> tuple[Path, Path, tuple[str, ...]]:
     """Write a mechanism of any format as a TOML description, and its tree as a URDF beside it.
 
@@ -38,7 +40,7 @@ def convert(
 
     Parameters
     ----------
-    path, cut, mesh_dirs, allow_outside
+    path, cut, mesh_dirs, allow_outside, massless, closing_tolerance
         As for :func:`srm_mbs.load`.
     out
         The description to write, ``.toml``; the URDF gets the same name with ``.urdf``.
@@ -65,7 +67,11 @@ def convert(
         )
     urdf = description.with_suffix(".urdf")
     overrides = Overrides(
-        cut=name_list(cut, "cut"), mesh_dirs=tuple(mesh_dirs), allow_outside=allow_outside
+        cut=name_list(cut, "cut"),
+        mesh_dirs=tuple(mesh_dirs),
+        allow_outside=allow_outside,
+        massless=massless,
+        closing_tolerance=closing_tolerance,
     )
     reading = read(path, overrides)
     source = reading.source

@@ -51,8 +51,8 @@ class Overrides:
     """Arguments of :func:`load`.
 
     ``gravity``, ``base`` and ``cut`` replace values of the file (None or empty: the file's);
-    ``keyframe`` names one of its states; ``mesh_dirs`` and ``allow_outside`` say which other files
-    it may name.
+    so do ``massless`` and ``closing_tolerance`` (None: the file's).  ``keyframe`` names one of its
+    states; ``mesh_dirs`` and ``allow_outside`` say which other files it may name.
     """
 
     gravity: Sequence[float] | None = None
@@ -61,6 +61,15 @@ class Overrides:
     mesh_dirs: tuple[str | Path, ...] = ()
     allow_outside: bool = False
     keyframe: str | None = None
+    massless: str | Mapping[str, float] | None = None
+    closing_tolerance: float | None = None
+
+    def entries(self) -> dict[str, Any]:
+        """Those that are keys of a description, which a saved run and a conversion keep."""
+        given = {"massless": self.massless, "closing_tolerance": self.closing_tolerance}
+        if isinstance(self.massless, Mapping):
+            given["massless"] = dict(self.massless)
+        return {key: value for key, value in given.items() if value is not None}
 
 
 def _gravity(value: Any) -> tuple[float, float, float]:
@@ -94,12 +103,15 @@ def _translated(
         )
     options = Options(overrides.cut or tuple(description.cut), entries, reach, keyframe)
     translation = found.translate(model, options)
-    text = own.text
+    text, given = own.text, overrides.entries()
     if translation.entries or found.key != "urdf":
         urdf_name = Path(model.file).with_suffix(".urdf").name
         entries = merged(entries, translation.entries, urdf_name)
-        text = tomli_w.dumps(entries)
+        text = ""
+    if given or not text:
+        entries = {**entries, **given}
         description = check_description(entries, own.file)
+        text = tomli_w.dumps(entries)
     base = description.base if overrides.base is None else overrides.base
     if not isinstance(base, str) or base not in ROOT_JOINTS:
         raise InputError(
@@ -203,6 +215,8 @@ def load(
     mesh_dirs: Sequence[str | Path] = (),
     allow_outside: bool = False,
     keyframe: str | None = None,
+    massless: str | Mapping[str, float] | None = None,
+    closing_tolerance: float | None = None,
 ) -> Mechanism:
     """Load a mechanism and assemble its initial state.
 
@@ -229,6 +243,14 @@ def load(
         Name of the keyframe of an MJCF file in which the mechanism starts (its number from 0, as
         text, if it has no name), instead of the pose of the file.  With closures its positions are
         the guess from which they close, and its rates are left out.
+    massless
+        What to do about moving ends of chains without inertia, which are an error by default:
+        ``"fix"`` locks the joints that move nothing but them; ``{"mass": m, "inertia": I}`` gives
+        each of their links a ball of m (kg) and I (kg m^2) at its origin.  A note names them.
+    closing_tolerance
+        Accuracy (m, rad) of the data of overconstrained loops that do not close exactly: closure
+        rows that the others imply to this tolerance, along the motion too, are left out, and a note
+        names them.  By default such loops are an error that names the residual.
 
     Raises
     ------
@@ -238,7 +260,14 @@ def load(
         If the loops cannot close or held values contradict each other.
     """
     overrides = Overrides(
-        gravity, base, name_list(cut, "cut"), tuple(mesh_dirs), allow_outside, keyframe
+        gravity,
+        base,
+        name_list(cut, "cut"),
+        tuple(mesh_dirs),
+        allow_outside,
+        keyframe,
+        massless,
+        closing_tolerance,
     )
     reading = read(path, overrides)
     with naming(file=reading.source.path):

@@ -1,4 +1,4 @@
-"""Triangles of STL, OBJ and COLLADA files, read here and by no importer, and inertia of solids.
+"""Triangles of STL, OBJ, COLLADA and MSH files, read by no importer, and inertia of solids.
 
 Only positions and faces are read: materials and textures, which name other files, are skipped.
 Polygons become fans of triangles about their first corner, except that a polygon that such a fan
@@ -21,8 +21,8 @@ from srm_mbs.errors import InputError, naming
 from srm_mbs.formats.files import read_bytes, shortened
 from srm_mbs.formats.xml import local_name, parse_xml
 
-SUFFIXES = (".stl", ".obj", ".dae")
-KNOWN = "Give an STL, OBJ or DAE file"
+SUFFIXES = (".stl", ".obj", ".dae", ".msh")
+KNOWN = "Give an STL, OBJ, DAE or MSH file"
 LARGEST_MESH = 128 * 10**6
 """Bytes of a mesh file."""
 MOST_TRIANGLES = 4 * 10**6
@@ -32,6 +32,8 @@ NODE_DEPTH = 100
 """Depth of nodes of COLLADA that instantiate each other."""
 MOST_INSTANCES = 10_000
 """Nodes and geometries that the scene of a COLLADA file instantiates."""
+MSH_HEADER = 16
+"""Bytes of an MSH file before its vertices."""
 STL_HEADER, STL_TRIANGLE = 84, 50
 """Bytes of a binary STL before its triangles, and of each triangle."""
 
@@ -110,6 +112,24 @@ def _merged(corners: FloatArray) -> Triangles:
         return corners, np.zeros((0, 3), dtype=np.int64)
     vertices, faces = np.unique(corners, axis=0, return_inverse=True)
     return vertices, faces.reshape(-1, 3)
+
+
+# MSH ------------------------------------------------------------------------------------------
+
+
+def _msh(content: bytes) -> Triangles:
+    """MuJoCo's binary format: the numbers of vertices, normals, texture coordinates and faces, then
+    these."""
+    if len(content) < MSH_HEADER:
+        raise ValueError("it has no header")
+    counts = np.frombuffer(content, "<i4", 4).astype(np.int64)
+    vertices, normals, textured, faces = (int(count) for count in counts)
+    numbers = 3 * vertices + 3 * normals + 2 * textured + 3 * faces
+    if counts.min() < 0 or len(content) != MSH_HEADER + 4 * numbers:
+        raise ValueError("its size does not agree with its numbers of vertices and faces")
+    places = np.frombuffer(content, "<f4", 3 * vertices, MSH_HEADER).astype(float)
+    corners = np.frombuffer(content, "<i4", 3 * faces, len(content) - 12 * faces)
+    return places.reshape(-1, 3), corners.reshape(-1, 3).astype(np.int64)
 
 
 # OBJ ------------------------------------------------------------------------------------------
@@ -402,7 +422,12 @@ PRIMITIVES: dict[str, Callable[[Element, Corners], Polygons]] = {
     "trifans": _fans,
 }
 
-READERS: dict[str, Callable[[bytes], Triangles]] = {".stl": _stl, ".obj": _obj, ".dae": _dae}
+READERS: dict[str, Callable[[bytes], Triangles]] = {
+    ".stl": _stl,
+    ".obj": _obj,
+    ".dae": _dae,
+    ".msh": _msh,
+}
 
 
 def solid(kind: str, sizes: FloatArray) -> tuple[float, FloatArray]:

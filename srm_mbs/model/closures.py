@@ -20,7 +20,7 @@ The fields of :class:`LoopClosure` are the one list of the keys of a closure: de
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -105,6 +105,20 @@ class RowSet:
         lengths = len(self.directions) + len(self.distances)
         joints = lengths + len(self.alignments)
         return slice(0, lengths), slice(lengths, joints), slice(joints, self.count)
+
+    def without(self, labels: Collection[str]) -> RowSet:
+        """The same rows but those called ``labels``."""
+        kept = np.array([label not in labels for label in self.labels])
+        own = [kept[block] for block in self.blocks]
+        k = len(self.directions)
+        return replace(
+            self,
+            labels=tuple(label for label in self.labels if label not in labels),
+            directions=self.directions[own[0][:k]],
+            distances=tuple(np.array(self.distances)[own[0][k:]].tolist()),
+            alignments=self.alignments[own[1]],
+            joint_rows=tuple(row for row, keep in zip(self.joint_rows, own[2]) if keep),
+        )
 
 
 @dataclass(frozen=True)
@@ -293,6 +307,9 @@ class LoopClosure:
         ``coupling`` of two joints: q_a = ratio q_b + offset, in rad or m; offset 0 by default.
     coefficients
         ``coupling`` of any number of joints, instead of ``ratio``: sum c_i q_i = offset.
+    without
+        Labels of rows that are left out, because other closures imply them; the others are as they
+        are in the type.
 
     Raises
     ------
@@ -317,6 +334,7 @@ class LoopClosure:
     ratio: float | None = _key("a ratio", '"ratio = ..."')
     coefficients: tuple[float, ...] | None = _key("coefficients", '"coefficients = [...]"')
     offset: float | None = _key("an offset", '"offset = ..."')
+    without: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         places = name_places(self._element, self.a, self.b)
@@ -336,7 +354,7 @@ class LoopClosure:
             if missing and key in kind.needs:
                 problem = f"a {kind.name} closure needs {entry.metadata['words']}"
                 raise self._fault(problem, entry.metadata["remedy"])
-            if not missing and key not in ("type", "name", *kind.needs, *kind.takes):
+            if not missing and key not in ("type", "name", "without", *kind.needs, *kind.takes):
                 raise self._fault(f"a {kind.name} closure takes no {key}", f'Remove "{key}"')
         for key in ("axis", "axis_a", "axis_b"):
             given = getattr(self, key)
@@ -346,6 +364,7 @@ class LoopClosure:
             self._take_length()
         if self.joints is not None:
             self._take_joints(self.joints)
+        self._take_without()
 
     @property
     def _element(self) -> str:
@@ -354,6 +373,19 @@ class LoopClosure:
 
     def _fault(self, problem: str, remedy: str) -> InputError:
         return InputError(problem, element=self._element, remedy=remedy)
+
+    def _take_without(self) -> None:
+        labels = (self.without,) if isinstance(self.without, str) else _listed(self.without)
+        known = self._of_type().labels if labels else ()
+        for label in labels:
+            if label not in known:
+                raise self._fault(
+                    f"a {self.kind.name} closure has no row {safe_repr(label)}",
+                    f"Known: {', '.join(known)}",
+                )
+        if labels and set(labels) == set(known):
+            raise self._fault("all its rows are left out", "Remove the closure")
+        object.__setattr__(self, "without", tuple(dict.fromkeys(map(plain, labels))))
 
     def _take_length(self) -> None:
         length = finite_number(self.length, "length", self._element)
@@ -440,6 +472,11 @@ class LoopClosure:
                 "its length is known only when it is part of a mechanism",
                 "Read it from mechanism.loops, or give a length",
             )
+        rows = self._of_type()
+        return rows.without(self.without) if self.without else rows
+
+    def _of_type(self) -> RowSet:
+        """All rows that its type has."""
         given: dict[str, Any] = {
             key: np.array(getattr(self, key))
             for key in ("axis", "axis_a", "axis_b")

@@ -31,7 +31,7 @@ from srm_mbs.model.anchors import (
     resolve_moving,
 )
 from srm_mbs.model.laws import Law
-from srm_mbs.model.numbers import checked_name, finite_array
+from srm_mbs.model.numbers import checked_name, finite_array, finite_numbers, plain
 
 
 def quantity(
@@ -341,6 +341,80 @@ class TorsionSpring(ForceElement):
 
 
 @dataclass(frozen=True)
+class CouplingSpring(ForceElement):
+    """Spring and damper on a sum of joint coordinates, as a cable over several joints has it.
+
+    With y = sum c_i q_i, the joint i has the force tau_i = -c_i (k (y - y_0) + c dy/dt).
+
+    Parameters
+    ----------
+    joints
+        Names of revolute and prismatic joints.
+    coefficients
+        c_i of each joint, not zero; y has the unit of the products (m, if they are radii in m/rad).
+    stiffness, damping
+        k and c, not negative: per unit of y, N/m and N s/m where that is m.
+    rest
+        y_0 in the unit of y.
+    name
+        Unique name.
+
+    Raises
+    ------
+    InputError
+        For a value that is negative or not finite, or joints and coefficients of unequal number.
+    """
+
+    type: ClassVar[str] = "coupling_spring"
+    has_potential: ClassVar[bool] = True
+    joints: tuple[str, ...]
+    coefficients: tuple[float, ...]
+    stiffness: float = quantity("", 0.0, nonnegative=True)
+    damping: float = quantity("", 0.0, nonnegative=True)
+    rest: float = quantity("", 0.0)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        joints = (self.joints,) if isinstance(self.joints, str) else self.joints
+        several = isinstance(joints, list | tuple) and len(joints) > 0
+        if not several or not all(isinstance(name, str) for name in joints):
+            raise self._fault(
+                f"joints = {safe_repr(self.joints)} is not a list of names",
+                'Give "joints = [first, second]"',
+            )
+        self._set("joints", tuple(map(plain, joints)))
+        for name in self.joints:
+            if self.joints.count(name) > 1:
+                raise self._fault(
+                    f"the joint {name!r} is named twice", "Keep one, with the sum of both"
+                )
+        self._take_name(*self.joints)
+        numbers = finite_numbers(
+            self.coefficients,
+            len(self.joints),
+            "coefficients",
+            "Give one number for each joint",
+            self._element,
+        )
+        if 0.0 in numbers:
+            raise self._fault("a coefficient is zero", "Remove that joint from the list")
+        self._set("coefficients", numbers)
+        self._take_quantities()
+        self._refuse_zeros("stiffness", "damping")
+
+    def check(self, model: pin.Model) -> None:
+        for name in self.joints:
+            joint = one_degree_joint(
+                model, name, self._element, "Name joints with one degree of freedom"
+            )
+            if joint.nq != 1:
+                raise self._fault(
+                    f"the angle of the continuous joint {name!r} does not count turns",
+                    'Make the joint "revolute" in the URDF, with wide limits: they do not act',
+                )
+
+
+@dataclass(frozen=True)
 class Wrench(ForceElement):
     """A force and moment on a link, constant or over time.
 
@@ -494,7 +568,10 @@ class LimitSpring(ForceElement):
 FORCE_TYPES: Mapping[str, Callable[..., ForceElement]] = MappingProxyType(
     {
         kind.type: kind
-        for kind in (SpringDamper, JointTorque, TorsionSpring, Wrench, Bushing, LimitSpring)
+        for kind in (
+            *(SpringDamper, JointTorque, TorsionSpring, Wrench, Bushing, LimitSpring),
+            CouplingSpring,
+        )
     }
 )
 """The force elements by their type in a description."""

@@ -54,7 +54,7 @@ def to_pinocchio(
     :meth:`srm_mbs.Mechanism.to_pinocchio`."""
     models, names, without = pin.StdVec_RigidConstraintModel(), [], []
     for loop in loops:
-        if loop.type not in _KINDS or loop.a is None or loop.b is None:
+        if loop.type not in _KINDS or loop.without or loop.a is None or loop.b is None:
             without.append(loop.name)
             continue
         (a, in_a), (b, in_b) = loop.a.resolve(model), loop.b.resolve(model)

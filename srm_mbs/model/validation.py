@@ -20,6 +20,13 @@ from srm_mbs.model.numbers import finite_array
 ARTICULATED_INERTIA_TOLERANCE = 1e-13
 """Articulated inertia, over the composite one, below which it is rounding."""
 
+LOADED = (
+    ', or load it with massless="fix", which locks the joints of massless ends, or with '
+    'massless={"mass": ..., "inertia": ...}, which gives their links balls of that inertia '
+    "(--massless)"
+)
+"""Remedies for files, where the model was read from one."""
+
 
 def check_inertia(model: pin.Model, file: str | None = None) -> None:
     """Refuse joints that move no inertia: the equations of motion have no solution.
@@ -33,11 +40,6 @@ def check_inertia(model: pin.Model, file: str | None = None) -> None:
     """
     if model.nv == 0:
         return
-    moved = np.zeros((model.njoints, 2))
-    for joint in range(model.njoints - 1, 0, -1):
-        inertia = model.inertias[joint]
-        moved[joint] += inertia.mass, np.trace(inertia.inertia)
-        moved[model.parents[joint]] += moved[joint]
 
     def links(joint: int) -> str:
         names = [
@@ -47,14 +49,13 @@ def check_inertia(model: pin.Model, file: str | None = None) -> None:
         ]
         return ", ".join(names) or "its body"
 
-    for joint in range(1, model.njoints):
-        if not moved[joint].any():
-            raise InputError(
-                f"neither {links(joint)} nor anything that it carries has inertia",
-                file=file,
-                element=f"joint {model.names[joint]!r}",
-                remedy="Give the moving end of the chain an <inertial>",
-            )
+    for joint in massless_ends(model):
+        raise InputError(
+            f"neither {links(joint)} nor anything that it carries has inertia",
+            file=file,
+            element=f"joint {model.names[joint]!r}",
+            remedy=f"Give the moving end of the chain an <inertial>{LOADED if file else ''}",
+        )
     rng = np.random.default_rng(0)
     q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
     at = undetermined_joint(model, q, file)
@@ -66,6 +67,16 @@ def check_inertia(model: pin.Model, file: str | None = None) -> None:
             element=f"joint {model.names[at]!r}",
             remedy="Give a moment of inertia, or a centre of mass off the axis",
         )
+
+
+def massless_ends(model: pin.Model) -> list[int]:
+    """The joints that move neither mass nor inertia, from the root to the tips."""
+    moved = np.zeros((model.njoints, 2))
+    for joint in range(model.njoints - 1, 0, -1):
+        inertia = model.inertias[joint]
+        moved[joint] += inertia.mass, np.trace(inertia.inertia)
+        moved[model.parents[joint]] += moved[joint]
+    return [joint for joint in range(1, model.njoints) if not moved[joint].any()]
 
 
 def undetermined_joint(

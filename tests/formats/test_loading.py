@@ -861,6 +861,62 @@ def test_a_massless_end_may_be_locked(tmp_path: Path) -> None:
     assert srm.load(write(tmp_path, text, 'lock = ["pole"]\n')).model.nv == 6
 
 
+def with_flag() -> str:
+    """The zoo with a massless chain of two links, whose tip follows its first joint."""
+    end = (
+        '<link name="flag"/><joint name="pole" type="continuous"><parent link="raft"/>'
+        '<child link="flag"/><axis xyz="0 0 1"/></joint><link name="pennant"/>'
+        '<joint name="rope" type="revolute"><parent link="flag"/><child link="pennant"/>'
+        '<axis xyz="0 0 1"/><limit lower="0" upper="1" effort="1" velocity="1"/>'
+        '<mimic joint="pole" multiplier="2"/></joint></robot>'
+    )
+    return zoo_urdf().replace("</robot>", end)
+
+
+def test_joints_of_massless_ends_are_locked_on_request_and_named(tmp_path: Path) -> None:
+    with pytest.raises(srm.InputError, match=r'massless="fix".*massless={"mass"') as caught:
+        srm.load(write(tmp_path, with_flag()))
+    assert caught.value.element == "joint 'pole'"
+    plain_zoo = srm.load(write(tmp_path, zoo_urdf()))
+    path = write(tmp_path, with_flag())
+    described = write(tmp_path, with_flag(), 'massless = "fix"\n')
+    for mechanism in (srm.load(path, massless="fix"), srm.load(described)):
+        assert mechanism.joint_names == plain_zoo.joint_names
+        assert mechanism.loops == ()
+        (note,) = (note for note in mechanism.notes if "massless" in note)
+        assert "'pole', 'rope', and their couplings left out: 'pole', 'rope'" in note
+
+
+def test_links_of_massless_ends_get_a_stated_inertia(tmp_path: Path) -> None:
+    """As the same file with these balls written into it."""
+    ball = (
+        '<inertial><mass value="0.25"/>'
+        '<inertia ixx="0.5" iyy="0.5" izz="0.5" ixy="0" ixz="0" iyz="0"/></inertial>'
+    )
+    written = with_flag()
+    for name in ("flag", "pennant"):
+        written = written.replace(f'<link name="{name}"/>', f'<link name="{name}">{ball}</link>')
+    expected = srm.load(write(tmp_path, written))
+    given = {"mass": 0.25, "inertia": 0.5}
+    mechanism = srm.load(write(tmp_path, with_flag()), massless=given)
+    assert any("0.25 kg and 0.5 kg m^2" in note and "'rope'" in note for note in mechanism.notes)
+    for q, _ in states(mechanism.model):
+        found, wanted = (mass_matrix(m.model, q) for m in (mechanism, expected))
+        np.testing.assert_allclose(found, wanted, atol=1e-14)
+    run = srm.simulate(mechanism, 0.1)
+    run.save(tmp_path / "run.npz")
+    again = srm.load_solution(tmp_path / "run.npz")
+    np.testing.assert_array_equal(again.q, run.q)
+    assert again.mechanism.model.inertias[-1].mass == 0.25
+
+
+@pytest.mark.parametrize("given", ["weld", {"mass": 1.0}, {"mass": -1.0, "inertia": 1.0}])
+def test_other_treatments_of_massless_ends_are_refused(given: Any, tmp_path: Path) -> None:
+    with pytest.raises(srm.InputError, match=r'Write "fix", or \{ mass') as caught:
+        srm.load(write(tmp_path, with_flag()), massless=given)
+    assert caught.value.element == "massless"
+
+
 def test_a_massless_link_inside_a_chain_is_no_fault(tmp_path: Path) -> None:
     text = zoo_urdf()
     inertial = INERTIAL.format(**LINKS["slide"])

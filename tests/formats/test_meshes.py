@@ -43,6 +43,17 @@ def binary_stl() -> bytes:
     return b"solid, but binary".ljust(80) + struct.pack("<I", 4) + b"".join(triangles)
 
 
+def msh() -> bytes:
+    """With four normals and texture coordinates, which are skipped."""
+    counts = np.array([4, 4, 4, 4], "<i4").tobytes()
+    return (
+        counts
+        + CORNERS.astype("<f4").tobytes()
+        + np.ones(4 * 5, "<f4").tobytes()
+        + np.array(FACES, "<i4").tobytes()
+    )
+
+
 def ascii_stl() -> str:
     facets = (
         "facet normal 0 0 0\n outer loop\n"
@@ -59,6 +70,7 @@ def obj(faces: str) -> str:
 
 
 TETRAHEDRA: dict[str, tuple[str, str | bytes]] = {
+    "MSH": ("a.msh", msh()),
     "binary STL": ("a.stl", binary_stl()),
     "ASCII STL": ("a.STL", ascii_stl()),
     "OBJ": ("a.obj", obj("f 1 3 2\nf 1//1 2//1 4//1\nf 1/1 4/1 3/1\nf 2/1/1 3/1/1 \\\n4/1/1\n")),
@@ -120,6 +132,8 @@ REFUSED: dict[str, tuple[str, str | bytes, str]] = {
     "glTF": ("a.gltf", "{}", "'.gltf' are not read"),
     "glTF named as OBJ": ("a.obj", '{"buffers": [{"uri": "secret"}]}', "no triangles"),
     "no suffix": ("a", "v 0 0 0", "are not read"),
+    "MSH that is too short": ("a.msh", msh()[:-1], "not a mesh of type"),
+    "MSH with negative numbers": ("a.msh", np.array([4, -1, 0, 3], "<i4").tobytes(), "not a mesh"),
     "text as STL": ("a.stl", "ssh-rsa AAAA", "not a mesh of type"),
     "STL that is too short": ("a.stl", binary_stl()[:-1], "not a mesh of type"),
     "STL with half a triangle": ("a.stl", "solid\nvertex 1 2 3\nvertex 1 2 3\n", "no triangles"),

@@ -77,6 +77,9 @@ def coordinates(element: Any) -> Coordinates:
     if isinstance(element, srm.TorsionSpring):
         index = TREE.joints[TREE.getJointId(element.joint)].idx_q
         return lambda q: q[index : index + 1]
+    if isinstance(element, srm.CouplingSpring):
+        places = [TREE.joints[TREE.getJointId(name)].idx_q for name in element.joints]
+        return lambda q: np.array([np.dot(element.coefficients, q[places])])
 
     def y(q: FloatArray) -> FloatArray:
         (Ra, pa), (Rb, pb) = placement(TREE, q, element.a), placement(TREE, q, element.b)
@@ -87,9 +90,12 @@ def coordinates(element: Any) -> Coordinates:
     return y
 
 
+RESTS = ("rest_length", "rest_angle", "rest")
+
+
 def rest(element: Any) -> float:
     """y where the spring is relaxed, in each component."""
-    return float(getattr(element, "rest_length", getattr(element, "rest_angle", 0.0)))
+    return float(next((getattr(element, key) for key in RESTS if hasattr(element, key)), 0.0))
 
 
 def slope(of: Coordinates, q: FloatArray) -> FloatArray:
@@ -126,6 +132,9 @@ CASES: dict[str, Any] = {
     "damper across a branch": srm.SpringDamper(ANCHOR_A, srm.Anchor("tail"), damping=2.5),
     "torsion spring": srm.TorsionSpring("hinge", 6.0, 0.4, 0.3),
     "spring of a slide": srm.TorsionSpring("slide", 60.0, 4.0, -0.2),
+    "spring on several joints": srm.CouplingSpring(
+        ("branch", "slide", "hinge"), (0.4, -2.0, 0.7), 30.0, 2.0, 0.1
+    ),
     "bushing between links": srm.Bushing(ANCHOR_A, ANCHOR_B, SIX_K, SIX_C),
     "bushing to the ground": srm.Bushing(ANCHOR_A, GROUND, SIX_K, SIX_C),
     "bushing from the ground": srm.Bushing(GROUND, ANCHOR_B, SIX_K),
@@ -577,6 +586,12 @@ SENSELESS: dict[str, Callable[[], Any]] = {
     "negative rest_length": lambda: srm.SpringDamper(ANCHOR_A, GROUND, 1.0, 0.0, -1.0),
     "a nan": lambda: srm.SpringDamper(ANCHOR_A, GROUND, np.nan, 0.0, 1.0),
     "a text": lambda: srm.SpringDamper(ANCHOR_A, GROUND, "x", 0.0, 1.0),  # type: ignore[arg-type]
+    "a spring on no joints": lambda: srm.CouplingSpring((), (), 1.0),
+    "a spring on joints that are no names": lambda: srm.CouplingSpring((1, 2), (1.0, 1.0), 1.0),  # type: ignore[arg-type]
+    "a spring on one joint twice": lambda: srm.CouplingSpring(("a", "a"), (1.0, 2.0), 1.0),
+    "a coefficient too few": lambda: srm.CouplingSpring(("a", "b"), (1.0,), 1.0),
+    "a coefficient of zero": lambda: srm.CouplingSpring(("a", "b"), (1.0, 0.0), 1.0),
+    "a spring on joints without effect": lambda: srm.CouplingSpring(("a", "b"), (1.0, 1.0)),
     "a torsion spring without effect": lambda: srm.TorsionSpring("hinge"),
     "an infinite angle": lambda: srm.TorsionSpring("hinge", 1.0, 0.0, np.inf),
     "a torque of nan": lambda: srm.JointTorque("hinge", np.nan),
@@ -599,6 +614,11 @@ UNFIT: dict[str, tuple[pin.Model, srm.ForceElement]] = {
     "torque on no joint": (TREE, srm.JointTorque("hing", 1.0)),
     "one torque on a ball": (TREE, srm.JointTorque("ball", 1.0)),
     "two torques on a hinge": (TREE, srm.JointTorque("hinge", (1.0, 2.0))),
+    "spring on a hinge and a ball": (TREE, srm.CouplingSpring(("hinge", "ball"), (1.0, 1.0), 1.0)),
+    "spring on a continuous joint and no other": (
+        WHEEL,
+        srm.CouplingSpring(("wheel",), (1.0,), 1.0),
+    ),
     "torsion spring on a ball": (TREE, srm.TorsionSpring("ball", 1.0)),
     "torsion spring on the universe": (TREE, srm.TorsionSpring("universe", 1.0)),
     "torsion spring on a continuous joint": (WHEEL, srm.TorsionSpring("wheel", 1.0)),

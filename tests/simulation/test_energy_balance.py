@@ -46,6 +46,9 @@ ELEMENTS: dict[str, srm.ForceElement] = {
         COUPLER, GROUND, stiffness=20.0, damping=1.5, rest_length=0.5, name="it"
     ),
     "torsion_spring": srm.TorsionSpring("crank", 3.0, 0.2, 0.4, name="it"),
+    "coupling_spring": srm.CouplingSpring(
+        ("crank", "coupler"), (0.6, -1.5), 4.0, 0.3, 0.2, name="it"
+    ),
     "torque": srm.JointTorque("crank", 0.7, name="it", law=srm.Sine(1.0, omega=5.0, offset=1.0)),
     "limit_spring": srm.LimitSpring("crank", 30.0, 5.0, upper=1.2, depth=0.1, name="it"),
     "wrench": srm.Wrench(COUPLER, (0.3, 0.0, 1.0), (0.1, 0.4, 0.2), "link", name="it"),

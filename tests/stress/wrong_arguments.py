@@ -204,6 +204,11 @@ def calls(folder: Path) -> dict[str, Call]:
             {"stiffness": 1.0, "damping": 0.1, "rest_length": 0.1, "name": "x"},
         ),
         "TorsionSpring": Call(srm.TorsionSpring, (crank,), {"stiffness": 1.0, "damping": 0.0}),
+        "CouplingSpring": Call(
+            srm.CouplingSpring,
+            ((crank,), (1.0,)),
+            {"stiffness": 1.0, "damping": 0.0, "rest": 0.0},
+        ),
         "LimitSpring": Call(
             srm.LimitSpring, (crank,), {"stiffness": 1.0, "lower": -1.0, "upper": 1.0}
         ),

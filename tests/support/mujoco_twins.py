@@ -117,13 +117,16 @@ class Twins:
         out = []
         for loop in self.entries.get("loop", ()):
             if loop["type"] == "coupling":
-                first, second = (
-                    self.q[self.model.joints[self.model.getJointId(name)].idx_q]
-                    for name in loop["joints"]
+                positions = np.array(
+                    [
+                        self.q[self.model.joints[self.model.getJointId(name)].idx_q]
+                        for name in loop["joints"]
+                    ]
                 )
-                residual = first - loop["ratio"] * second - loop["offset"]
+                factors = np.array(loop.get("coefficients") or [1.0, -loop["ratio"]])
+                residual = factors @ positions - loop["offset"]
                 # Those of tendons have a factor of their own.
-                out.append(np.abs([residual]) / np.hypot(1.0, loop["ratio"]))
+                out.append(np.abs([residual]) / np.linalg.norm(factors))
                 continue
             a, b = self.anchor(loop["a"]), self.anchor(loop["b"])
             out.append(a.translation - b.translation)

@@ -92,6 +92,19 @@ double limit_spring(const ForceElement& e, double position, double rate) {
     return -(contact * (e.stiffness * beyond + e.damping * rate));
 }
 
+// The force on a sum of coordinates.
+void coupling_spring(const ForceElement& e, const double* q, const double* v, double* tau,
+                     ForceLaws* laws, int law) {
+    double sum = 0.0, rate = 0.0;
+    for (std::size_t k = 0; k < e.columns.size(); ++k) {
+        sum += e.signs[k] * q[e.positions[k]];
+        rate += e.signs[k] * v[e.columns[k]];
+    }
+    double force = -(e.stiffness * (sum - e.rest) + e.damping * rate);
+    if (laws) force = laws->acting(law, force);
+    for (std::size_t k = 0; k < e.columns.size(); ++k) tau[e.columns[k]] += e.signs[k] * force;
+}
+
 void wrench(const ForceElement& e, double t, const pinocchio::Data& data, double* tau) {
     const SE3 at = placement(e.a, data);
     Vector3d force(over_time(e, 0, t), over_time(e, 1, t), over_time(e, 2, t));
@@ -156,6 +169,8 @@ void ForceElement::check() const {
     if (kind == ForceKind::wrench) expect_size("numbers", numbers.size(), 6);
     if (kind == ForceKind::bushing) expect_size("numbers", numbers.size(), 12);
     if (kind == ForceKind::limit_spring) expect_size("numbers", numbers.size(), 3);
+    if (kind == ForceKind::coupling_spring)
+        expect_size("positions", positions.size(), columns.size());
     if (curves.size() > 1) expect_size("curves", curves.size(), numbers.size());
 }
 
@@ -230,7 +245,9 @@ void ForceLaws::resolve(const std::vector<ForceElement>& elements,
         if (acted[i]) of_coordinate_[i] = count++;
     for (std::size_t k = 0; k < elements.size(); ++k) {
         const ForceElement& e = elements[k];
-        if (e.kind == ForceKind::spring_damper && e.rest > 0.0) of_element_[6 * k] = count++;
+        if ((e.kind == ForceKind::spring_damper && e.rest > 0.0) ||
+            e.kind == ForceKind::coupling_spring)
+            of_element_[6 * k] = count++;
         for (int i = 0; e.kind == ForceKind::bushing && i < 6; ++i)
             if (e.numbers[i] > 0.0 || e.numbers[6 + i] > 0.0) of_element_[6 * k + i] = count++;
     }
@@ -269,6 +286,9 @@ void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 break;
             case ForceKind::limit_spring:
                 on_joint(e, limit_spring(e, q[e.in_q], v[e.in_v]));
+                break;
+            case ForceKind::coupling_spring:
+                coupling_spring(e, q, v, tau, laws, laws ? laws->of_element(number, 0) : -1);
                 break;
         }
     }

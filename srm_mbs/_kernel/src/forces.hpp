@@ -14,7 +14,15 @@ struct Workspace;
 namespace srm {
 
 // Numbered as by the `constants` of the elements in Python.
-enum class ForceKind { spring_damper, joint_torque, torsion_spring, wrench, bushing, limit_spring };
+enum class ForceKind {
+    spring_damper,
+    joint_torque,
+    torsion_spring,
+    wrench,
+    bushing,
+    limit_spring,
+    coupling_spring,
+};
 
 using Placement = std::array<double, 12>;  // rotation row by row, translation
 
@@ -32,10 +40,11 @@ struct Anchor {
     field(Anchor, a)                 /* the only anchor of a wrench */                     \
     field(Anchor, b)                                                                       \
     field(std::vector<int>, columns) /* velocity components that move a against b, */      \
-    field(std::vector<double>, signs) /* +1 where they move a, -1 where b */               \
+    field(std::vector<double>, signs) /* +1 where they move a, -1 where b; or coefficients */ \
+    field(std::vector<int>, positions) /* of a coupling spring: indices in q of the columns */ \
     field(double, stiffness)                                                               \
     field(double, damping)                                                                 \
-    field(double, rest)              /* length or angle */                                 \
+    field(double, rest)              /* length, angle or sum */                                 \
     field(int, in_q)                 /* first index of the joint in q, and in v */         \
     field(int, in_v)                                                                       \
     field(bool, in_link_axes)        /* of a wrench: else world axes */                    \

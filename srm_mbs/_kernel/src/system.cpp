@@ -159,6 +159,7 @@ void check_indices(const SystemData& data, const pinocchio::Model& model) {
         for (const Anchor* anchor : {&force.a, &force.b})
             expect_within("Anchor.joint", anchor->joint, 0, joints - 1);
         expect_within("ForceElement.columns", force.columns, 0, nv - 1);
+        expect_within("ForceElement.positions", force.positions, 0, nq - 1);
         const bool torque = force.kind == ForceKind::joint_torque;
         const long last = torque ? static_cast<long>(force.numbers.size()) : 1;
         const bool on_joint = torque || force.kind == ForceKind::torsion_spring ||

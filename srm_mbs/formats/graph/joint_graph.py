@@ -9,6 +9,7 @@ only if the loop has no other joint.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -146,6 +147,15 @@ class Joint:
             axis=first,
             second_axis=second,
         )
+
+
+THREAD_PITCH = "<thread_pitch> x is read as libsdformat converts it, -2 pi/x metres per turn"
+"""Note about :func:`metres_per_turn`."""
+
+
+def metres_per_turn(thread_pitch: float) -> float:
+    """The pitch of a screw from the ``<thread_pitch>`` of SDF, which is not zero."""
+    return -2.0 * math.pi / thread_pitch
 
 
 def _negative(axis: Direction) -> Direction:

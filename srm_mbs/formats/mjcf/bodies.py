@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.formats.graph.joint_graph import Body, Joint, inertia_at
+from srm_mbs.formats.graph.joint_graph import FREEDOM, Body, Joint, inertia_at
 from srm_mbs.formats.graph.spanning_tree_to_urdf import anchor
 from srm_mbs.formats.mjcf.attributes import BODY_IGNORED, BODY_READ, Attributes, MjcfValues
 from srm_mbs.formats.mjcf.geoms import Geom, Mesh, inertia_of, read_geom, visuals_of
@@ -30,8 +30,23 @@ JOINT_TYPES = ("hinge", "slide", "ball", "free")
 MOST_REPLICATED = 2000
 """Number of elements that the replicates of a file add: a line of text makes no more than some
 hundred bodies, which load in two seconds."""
+REFUSED = {
+    "flexcomp": "a deformable body",
+    "composite": "a chain or net of bodies",
+    "attach": "a part of another model",
+}
+"""Elements of a body that are refused, and what they are."""
 FLAGS = {"stiffness": "spring", "damping": "damper", "friction": "frictionloss"}
 """Properties of a joint, and the flags that switch them off."""
+_LINEAR, _ANGULAR = np.eye(6)[:3], np.eye(6)[3:]
+MOTIONS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "fixed": lambda axis: np.zeros((0, 6)),
+    "revolute": lambda axis: axis[None] @ _ANGULAR,
+    "prismatic": lambda axis: axis[None] @ _LINEAR,
+    "spherical": lambda axis: _ANGULAR,
+    "floating": lambda axis: np.eye(6),
+}
+"""Twists (freedom, 6) of the joints, linear then angular, in their frames."""
 URDF_TYPES = {"hinge": "revolute", "slide": "prismatic", "ball": "spherical"}
 
 
@@ -52,8 +67,8 @@ class BodyReader:
         Body and placement in it, by name.
     forces
         Springs of ball joints.
-    references
-        ``ref`` of the joints, by name.
+    references, rests
+        ``ref`` and ``springref`` of the joints, by name.
     added
         Armatures of free joints by body.
     compensated
@@ -71,12 +86,14 @@ class BodyReader:
         self.sites: dict[str, tuple[str, pin.SE3]] = {}
         self.forces: list[dict[str, Any]] = []
         self.references: dict[str, float] = {}
+        self.rests: dict[str, float] = {}
         self.compensated: dict[str, float] = {}
         self.meshes: dict[str, Mesh] = {}
         self.colours: dict[str, str] = {}
         self._names: set[str] = set()
         self._moving: set[str] = set()
         self._replicated = 0
+        self._timed: dict[str, tuple[float, float]] = {}
 
     def world(self, node: Element) -> None:
         """Read a ``<worldbody>``."""
@@ -121,6 +138,9 @@ class BodyReader:
         """Read the elements of a body or of a ``<frame>``; geoms and inertials into ``found``."""
         values = self.values
         where = f"body {name!r}"
+        for tag, what in REFUSED.items():
+            if node.find(tag) is not None:
+                raise values.fault(where, f"<{tag}> ({what}) is not read", "Remove it")
         many = ("geom", "site", "body", "frame", "joint", "replicate")
         values.children(node, where, BODY_READ, BODY_IGNORED, many)
         for child in node:
@@ -253,6 +273,65 @@ class BodyReader:
                 scaled = pin.Inertia(factor * inertia.mass, inertia.lever, factor * inertia.inertia)
                 self.bodies[name] = replace(body, inertia=scaled)
 
+    def resolve_springdampers(self) -> None:
+        """Replace ``springdamper``, a time constant T (s) and a damping ratio z, by stiffness and
+        damping as MuJoCo's compiler does: I/(T z)^2 and 2 I/T, with I = 1/mean of the joint's part
+        of the diagonal of M^-1 in the pose of the file."""
+        if not self._timed:
+            return
+        mobility, first = self._mobility()
+        for k, joint in enumerate(self.joints):
+            if joint.name not in self._timed:
+                continue
+            timeconst, ratio = self._timed[joint.name]
+            at = first[joint.name]
+            inertia = 1.0 / float(mobility[at : at + FREEDOM[joint.type]].mean())
+            off = self.values.off
+            stiffness = 0.0 if "spring" in off else inertia / (timeconst * ratio) ** 2
+            damping = 0.0 if "damper" in off else 2.0 * inertia / timeconst
+            if joint.type == "spherical":
+                self._spring(joint, stiffness)
+                stiffness = 0.0
+            self.joints[k] = replace(joint, stiffness=stiffness, damping=damping)
+
+    def _mobility(self) -> tuple[FloatArray, dict[str, int]]:
+        """Diagonal (nv,) of the inverse of the mass matrix in the pose of the file, and the first
+        velocity component of each joint by name."""
+        above = {joint.child: joint for joint in (*self.joints, *self.free.values())}
+        first: dict[str, int] = {}
+        nv = 0
+        for joint in above.values():
+            first[joint.name] = nv
+            nv += FREEDOM[joint.type]
+        twists, armature = np.zeros((6, nv)), np.zeros(nv)
+        for joint in above.values():
+            at = first[joint.name]
+            own = slice(at, at + FREEDOM[joint.type])
+            place = self.placements[joint.child] * joint.in_child
+            motions = MOTIONS[joint.type](np.array(joint.axis))
+            twists[:, own] = place.toActionMatrix() @ motions.T
+            armature[own] = joint.armature
+        M = np.diag(armature)
+        for name, body in self.bodies.items():
+            if body.inertia is None:
+                continue
+            moving, at_body = np.zeros(nv, dtype=bool), name
+            while at_body in above:
+                joint = above[at_body]
+                moving[first[joint.name] : first[joint.name] + FREEDOM[joint.type]] = True
+                at_body = joint.parent
+            own_twists = self.placements[name].inverse().toActionMatrix() @ twists * moving
+            M += own_twists.T @ body.inertia.matrix() @ own_twists
+        try:
+            return np.diag(np.linalg.inv(M)), first
+        except np.linalg.LinAlgError:
+            name = next(iter(self._timed))
+            raise self.values.fault(
+                f"joint {name!r}",
+                "the inertia that springdamper refers to is zero",
+                "Give stiffness and damping",
+            ) from None
+
     # Joints ---------------------------------------------------------------------------------
 
     def _joints(
@@ -299,6 +378,15 @@ class BodyReader:
             kind = given.choice("type", JOINT_TYPES)
         self.order.append((name, kind, child))
         acting = _acting(given)
+        timeconst, ratio = given.numbers("springdamper", 2, "0 0").tolist()
+        if timeconst or ratio:
+            if not (timeconst > 0.0 and ratio > 0.0) or kind == "free":
+                raise given.fault(
+                    "springdamper is not two positive numbers of a hinge, slide or ball",
+                    "Give stiffness and damping",
+                )
+            self._timed[name] = timeconst, ratio
+            acting["stiffness"] = 0.0
         if kind == "free":
             if parent != WORLD or not alone:
                 raise given.fault(
@@ -317,7 +405,8 @@ class BodyReader:
         x, y, z = given.direction("axis", "0 0 1").tolist()
         in_si = values.angle if kind == "hinge" else float
         self.references[name] = ref = in_si(given.number("ref"))
-        rest = in_si(given.number("springref")) - ref
+        self.rests[name] = in_si(given.number("springref"))
+        rest = self.rests[name] - ref
         limits = _limits(given, in_si, ref)
         return replace(placed, axis=(x, y, z), rest=rest, **limits, **acting)
 
@@ -354,8 +443,6 @@ def _acting(given: Attributes) -> dict[str, Any]:
     """Stiffness, damping, friction and armature of a joint."""
     if given.flag("actuatorgravcomp"):
         given.values.ignore("actuatorgravcomp attribute")
-    if "springdamper" in given and given.numbers("springdamper", 2).any():
-        raise given.fault("springdamper is not read by this version", "Give stiffness and damping")
     found = {
         "stiffness": given.number("stiffness"),
         "damping": given.number("damping"),

@@ -231,16 +231,24 @@ class EqualityReader:
                         "offset": float(polynomial[0]) / factor,
                     }
                 )
+            case []:
+                raise given.fault("it couples no joint", 'Remove it, or write active="false"')
             case terms:
-                raise given.fault(
-                    f"it couples {len(terms)} joints, and not one or two",
-                    'Remove it, or write active="false"',
+                self.loops.append(
+                    {
+                        "name": name,
+                        "type": "coupling",
+                        "joints": [joint for joint, _ in terms],
+                        "coefficients": [factor for _, factor in terms],
+                        "offset": float(polynomial[0]),
+                    }
                 )
 
     # Tendons --------------------------------------------------------------------------------
 
     def springs(self) -> None:
-        """Read the forces of tendons: springs between two sites act, the rest is no force."""
+        """Read the forces of tendons: springs between two sites and those of fixed tendons act;
+        the rest is no force."""
         values = self.values
         for name, node in self._tendons:
             where = f"tendon {name!r}"
@@ -257,17 +265,16 @@ class EqualityReader:
                 continue
             ends = [child.get("site", "") for child in node if child.tag == "site"]
             rest = given.numbers("springlength", (1, 2), "-1")
-            if (
-                node.tag == "fixed"
-                or not len(node) == len(ends) == 2
-                or friction
-                or armature
-                or np.ptp(rest) != 0.0
-            ):
+            between = node.tag == "fixed" or len(node) == len(ends) == 2
+            if not between or friction or armature or np.ptp(rest) != 0.0:
                 raise given.fault(
-                    "only springs and dampers between two sites, with one rest length, are read",
+                    "only springs and dampers of fixed tendons and between two sites, with one "
+                    "rest length, are read",
                     "Remove its stiffness, damping, frictionloss and armature",
                 )
+            if node.tag == "fixed":
+                self._fixed_spring(name, node, where, stiffness, damping, float(rest[0]))
+                continue
             (body_a, at_a), (body_b, at_b) = (self.site(end, where) for end in ends)
             length = float(rest[0])
             if length < 0.0:
@@ -285,6 +292,33 @@ class EqualityReader:
                     "rest_length": length,
                 }
             )
+
+    def _fixed_spring(
+        self, name: str, node: Element, where: str, stiffness: float, damping: float, rest: float
+    ) -> None:
+        """The spring and damper of a fixed tendon, whose length is a sum of joint positions; by
+        default it is relaxed at the springrefs."""
+        references, factors = self.tree.references, self._coefficients(name, node)
+        for joint in factors:
+            if joint not in references:
+                problem = f"there is no hinge or slide {joint!r}"
+                raise self.values.unknown(where, problem, references)
+        terms = {joint: factor for joint, factor in factors.items() if factor}
+        if not terms:
+            raise self.values.fault(where, "its spring acts on no joint", "Remove its stiffness")
+        if rest < 0.0:
+            rest = sum(factor * self.tree.rests[joint] for joint, factor in terms.items())
+        self.forces.append(
+            {
+                "type": "coupling_spring",
+                "name": name,
+                "joints": list(terms),
+                "coefficients": list(terms.values()),
+                "stiffness": stiffness,
+                "damping": damping,
+                "rest": rest - sum(terms[joint] * references[joint] for joint in terms),
+            }
+        )
 
 
 def _point(placement: pin.SE3) -> pin.SE3:

@@ -64,7 +64,11 @@ def _compiler(values: MjcfValues, node: Element) -> None:
         given.flag(key)
     if "angle" in given:
         compiler.degrees = given.choice("angle", ("degree", "radian")) == "degree"
-    given.choice("coordinate", ("local",))
+    if given.choice("coordinate", ("local", "global")) == "global":
+        raise given.fault(
+            'coordinate="global" was removed from MuJoCo itself',
+            "Load the file in MuJoCo 2.3.3 or older and save it, which converts it",
+        )
     compiler.sequence = given.text("eulerseq", compiler.sequence)
     if len(compiler.sequence) != 3 or not set(compiler.sequence) <= set("xyzXYZ"):
         raise given.fault(f"eulerseq is {compiler.sequence!r}", "Write three of xyzXYZ")
@@ -172,6 +176,7 @@ def translate(document: Document, options: Options) -> Translation:
         raise values.fault("<worldbody>", "there is no <body>", "Add one for every body")
     tree.rescale()
     tree.add_rotors()
+    tree.resolve_springdampers()
     closures = EqualityReader(values, tree, root.findall("tendon"))
     for node in root.findall("equality"):
         closures.equality(node)

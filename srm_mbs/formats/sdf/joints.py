@@ -12,7 +12,13 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.formats.graph.joint_graph import Body, Direction, Joint
+from srm_mbs.formats.graph.joint_graph import (
+    THREAD_PITCH,
+    Body,
+    Direction,
+    Joint,
+    metres_per_turn,
+)
 from srm_mbs.formats.sdf.links import FRAMES_SINCE, MODEL, Frames, Scope, joint_frame
 from srm_mbs.formats.xml import XmlValues, words
 from srm_mbs.model.forces import OPEN_LIMIT
@@ -210,10 +216,8 @@ class JointReader:
         per_metre = values.child_number(node, "thread_pitch", where, 0.0)
         if per_metre == 0.0:
             raise values.fault(where, "<thread_pitch> is zero", "Give <screw_thread_pitch>")
-        values.remark(
-            "<thread_pitch> x is read as libsdformat converts it, -2 pi/x metres per turn", name
-        )
-        return -2.0 * math.pi / per_metre
+        values.remark(THREAD_PITCH, name)
+        return metres_per_turn(per_metre)
 
     def _axis(self, joint: Element, tag: str, at: pin.SE3, where: str, scope: Scope) -> Axis:
         """The axis in the element ``tag`` of a joint whose frame is placed at ``at``."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, Self, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -79,8 +79,15 @@ class Description(TopEntry):
                 )
 
     def coupled_joints(self) -> frozenset[str]:
-        """Names of the joints that take part in a coupling."""
-        return frozenset(name for entry in self.loop for name in entry.joints or ())
+        """Names of the joints that take part in a coupling, or in a spring on several joints."""
+        together = [*self.loop, *(entry for entry in self.force if hasattr(entry, "joints"))]
+        return frozenset(name for entry in together for name in entry.joints or ())
+
+    def with_locked(self, joints: Collection[str]) -> Self:
+        """The same description with ``joints`` locked as well, and without their couplings."""
+        loops = [entry for entry in self.loop if not set(joints).intersection(entry.joints or ())]
+        lock = [*self.lock, *(name for name in joints if name not in self.lock)]
+        return self.model_copy(update={"loop": loops, "lock": lock})
 
     def anchors(self) -> Iterator[tuple[str, Any]]:
         """Every anchor with its key, ``loop[0].a`` for example."""
@@ -383,6 +390,8 @@ PROBLEMS: dict[str, tuple[str | None, str]] = {
     "model_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
     "number": (None, "Give a finite number"),
     "greater_than": (None, "Give a positive number"),
+    "greater_than_equal": (None, "Give a number of at least 0"),
+    "massless": (None, 'Write "fix", or { mass = m, inertia = I } with positive numbers'),
     "too_short": (None, "Give the right number of values"),
     "too_long": (None, "Give the right number of values"),
     "literal_error": (None, "Choose one of those"),

@@ -42,8 +42,20 @@ def _joint_value(value: Any) -> float | list[float]:
     return _number(value)
 
 
+def _massless(value: Any) -> str | dict[str, float]:
+    if value in ("refused", "fix"):
+        return str(value)
+    if isinstance(value, Mapping) and set(value) == {"mass", "inertia"}:
+        numbers = {key: _number(part) for key, part in value.items()}
+        if min(numbers.values()) > 0.0:
+            return numbers
+    raise PydanticCustomError("massless", "a treatment of massless ends is wanted")
+
+
 Number = Annotated[float, PlainValidator(_number)]
+Massless = Annotated[str | dict[str, float], PlainValidator(_massless)]
 Positive = Annotated[Number, pydantic.Field(gt=0)]
+NotNegative = Annotated[Number, pydantic.Field(ge=0)]
 JointValue = Annotated[float | list[float], PlainValidator(_joint_value)]
 
 
@@ -200,6 +212,8 @@ class TopEntry(StrictEntry):
     gravity: Vector = [0.0, 0.0, -9.81]
     gravity_compensation: dict[StrictStr, Number] = {}
     lock: list[StrictStr] = []
+    massless: Massless = "refused"
+    closing_tolerance: NotNegative = 0.0
     limits: Literal["reported", "spring"] = "reported"
     friction_speed: Positive = FRICTION_SPEED
     loop: list[LoopEntry] = []

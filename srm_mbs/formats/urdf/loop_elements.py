@@ -11,7 +11,8 @@ In each of them a frame is placed on each of two links, by ``xyz`` and ``rpy`` a
 * Gazebo: ``<gazebo><joint>``, a joint of SDF that Gazebo inserts into the SDF that it makes of the
   URDF.  Its frame is given on the child, displaced by ``<pose>``; on the parent it is placed so
   that both coincide at q = 0.  Axes are in the joint's frame, or with
-  ``<use_parent_model_frame>`` in the root link's.
+  ``<use_parent_model_frame>`` in the root link's.  A screw, which no closure can be, goes into the
+  tree, and what held its child is cut.
 """
 
 from __future__ import annotations
@@ -19,17 +20,21 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement
 
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
+from srm_mbs.formats.graph.joint_graph import THREAD_PITCH, metres_per_turn
 from srm_mbs.formats.graph.spanning_tree_to_urdf import (
     CLOSURE_OF,
     anchor,
     bushing,
     closure,
+    is_identity,
+    numbers,
+    origin,
     placement,
 )
 from srm_mbs.formats.urdf.graph import Graph
@@ -317,8 +322,82 @@ class LoopElements(ElementChecker):
         force |= {"a": given["body_A"], "b": given["body_B"], "rest_length": given["free_length"]}
         self.forces.append(force | {key: given[key] for key in ("stiffness", "damping")})
 
+    def screws(self, root: Element) -> list[str]:
+        """Move the screws among the joints of Gazebo into the tree, because no closure has a
+        thread; names of the joints by which they hold their children."""
+        held = []
+        for block in root.findall("gazebo"):
+            for joint in block.findall("joint"):
+                if joint.get("type") == "screw":
+                    where = f"<gazebo><joint> {joint.get('name', '')!r}"
+                    held.append(self._gazebo_screw(root, joint, where))
+                    block.remove(joint)
+            if held and not len(block) and not block.attrib:
+                root.remove(block)
+        return held
+
+    def _gazebo_screw(self, root: Element, joint: Element, where: str) -> str:
+        """Add a screw of Gazebo to ``root``; name of the joint that holds its child."""
+        name = joint.get("name", "")
+        if not name or name in self.graph.joints:
+            raise self.fault(where, "another joint has its name", "Rename one of them")
+        pitch = self._gazebo_pitch(joint, where)
+        parent, child, (axis, _), damping = self._gazebo_ends(joint, where)
+        if WORLD in (parent[0], child[0]):
+            raise self.fault(where, "a screw on the ground is not read", "Name two links")
+        if axis is None:
+            raise self.fault(where, "it has no <axis>", "Give it")
+        if child[0] in self.graph.ancestors(parent[0]):
+            parent, child, axis = child, parent, -axis
+        screw = SubElement(root, "joint", name=name, type="screw")
+        SubElement(screw, "axis", xyz=numbers(axis))
+        SubElement(screw, "thread_pitch", value=numbers([pitch]))
+        if damping:
+            SubElement(screw, "dynamics", damping=numbers([damping]))
+        if is_identity(child[1]):
+            _hang(screw, parent[0], child[0], parent[1])
+            return name
+        between = f"{name}::joint_frame"
+        SubElement(root, "link", name=between)
+        _hang(screw, parent[0], between, parent[1])
+        fixed = SubElement(root, "joint", name=f"{name}::fixed", type="fixed")
+        _hang(fixed, between, child[0], child[1].inverse())
+        return f"{name}::fixed"
+
+    def _gazebo_pitch(self, joint: Element, where: str) -> float:
+        """Metres per turn of a screw, whose elements about it are removed."""
+        found = {}
+        for tag in ("thread_pitch", "screw_thread_pitch"):
+            node = joint.find(tag)
+            if node is not None:
+                self.leaf(node, where)
+                found[tag] = float(self.numbers(node.text, 1, where, f"<{tag}>")[0])
+                joint.remove(node)
+        if not any(found.values()):
+            raise self.fault(where, "it has no thread", "Give <screw_thread_pitch>, in m per turn")
+        if "screw_thread_pitch" in found:
+            return found["screw_thread_pitch"]
+        self.notes.append(f"{joint.get('name', '')!r}: {THREAD_PITCH}")
+        return metres_per_turn(found["thread_pitch"])
+
     def _gazebo_joint(self, joint: Element, where: str) -> None:
-        """Gazebo: the joint's frame is given on the child; at q = 0 that on the parent is there."""
+        """Gazebo: the joint becomes a closure."""
+        parent, child, axes, damping = self._gazebo_ends(joint, where)
+        self.joint(
+            self.kind(joint, where),
+            joint.get("name", ""),
+            parent,
+            child,
+            axes,
+            damping=damping,
+            where=where,
+        )
+
+    def _gazebo_ends(
+        self, joint: Element, where: str
+    ) -> tuple[End, End, list[FloatArray | None], float]:
+        """Parent, child, axes and damping: the joint's frame is given on the child; at q = 0 that
+        on the parent is there."""
         self.only(joint, where, ("name", "type"))
         known = {"parent": (), "child": (), "pose": ("relative_to", "frame")}
         inside = dict.fromkeys((*SDF_AXES, *NOT_ACTING))  # with any attributes
@@ -335,15 +414,7 @@ class LoopElements(ElementChecker):
             self._gazebo_axis(parts[tag], at, f"{where}, <{tag}>") if tag in parts else None
             for tag in SDF_AXES
         ]
-        self.joint(
-            self.kind(joint, where),
-            joint.get("name", ""),
-            (parent, poses[parent].actInv(at)),
-            (child, frame),
-            axes,
-            damping=damping,
-            where=where,
-        )
+        return (parent, poses[parent].actInv(at)), (child, frame), axes, damping
 
     def _gazebo_pose(self, node: Element | None, child: str, where: str) -> pin.SE3:
         """Placement of the joint's frame in the child link."""
@@ -380,6 +451,13 @@ class LoopElements(ElementChecker):
         if _text(parts.get("use_parent_model_frame")) in ("1", "true"):
             direction = at.rotation.T @ direction
         return direction
+
+
+def _hang(joint: Element, parent: str, child: str, at: pin.SE3) -> None:
+    """Add the two links of a joint of the tree to it, and its placement in the parent."""
+    SubElement(joint, "parent", link=parent)
+    SubElement(joint, "child", link=child)
+    origin(joint, at)
 
 
 def _text(node: Element | None) -> str:

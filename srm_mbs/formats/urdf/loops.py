@@ -18,7 +18,7 @@ URDF does not contain the type: the origins are joined, with a note.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -96,7 +96,8 @@ def translate(document: Document, options: Options) -> Translation:
     found = rewrite(root, extended)
     notes = extended.notes
     elements = LoopElements(document.file, Graph(root))
-    found |= _cut_second_parents(root, elements, options, notes)
+    held = elements.screws(root)
+    found |= _cut_second_parents(root, elements, options, notes, held) or bool(held)
     elements.graph = graph = Graph(root)
     found |= elements.read(root)
     found |= _mimics(elements, options, notes)
@@ -119,7 +120,7 @@ def translate(document: Document, options: Options) -> Translation:
         entries["force"] = _named(elements.forces, options.own.get("force", ()))
     if found:
         elements.named(root, "joint")
-        notes += elements.ignored_notes()
+        notes += [*elements.notes, *elements.ignored_notes()]
     return Translation(root, "" if found else document.text, entries, tuple(notes))
 
 
@@ -158,10 +159,18 @@ def _named(entries: list[dict[str, Any]], own: Any) -> list[dict[str, Any]]:
 
 
 def _cut_second_parents(
-    root: Element, reader: LoopElements, options: Options, notes: list[str]
+    root: Element,
+    reader: LoopElements,
+    options: Options,
+    notes: list[str],
+    held: Sequence[str] = (),
 ) -> bool:
     """Remove the joints that close loops and add their closures to ``reader``; whether there were
-    any."""
+    any.
+
+    Of several joints with the same child a screw, or one of those ``held``, stays in the tree, and
+    otherwise the first.
+    """
     by_child: dict[str, list[Element]] = {}
     for joint in reader.named(root, "joint", count=False).values():
         child = link_of(joint, "child")
@@ -173,7 +182,9 @@ def _cut_second_parents(
     cut = []
     for child, joints in by_child.items():
         wanted = [joint for joint in joints if joint.get("name") in options.cut]
-        kept = next((joint for joint in joints if joint not in wanted), None)
+        others = [joint for joint in joints if joint not in wanted]
+        threaded = (j for j in others if j.get("type") == "screw" or j.get("name") in held)
+        kept = next(threaded, next(iter(others), None))
         if kept is None:
             raise reader.fault(
                 f"joint {wanted[0].get('name', '')!r}",

@@ -8,6 +8,7 @@ rows.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -458,6 +459,7 @@ def _force(
     a: tuple[int, FloatArray] = _NO_ANCHOR,
     b: tuple[int, FloatArray] = _NO_ANCHOR,
     support: FloatArray = _NO_NUMBERS,
+    positions: Sequence[int] = (),
     stiffness: float = 0.0,
     damping: float = 0.0,
     rest: float = 0.0,
@@ -475,6 +477,7 @@ def _force(
         b=_core.Anchor(joint=b[0], placement=b[1]),
         columns=columns.tolist(),
         signs=support[columns].astype(float),
+        positions=list(positions),
         stiffness=stiffness,
         damping=damping,
         rest=rest,

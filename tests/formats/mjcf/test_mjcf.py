@@ -55,8 +55,35 @@ TENDONS = FOUR_BAR.replace('name="pin"', 'name="pin" active="false"').replace(
     '<fixed name="one"><joint joint="b" coef="1"/></fixed>'
     '<fixed name="other"><joint joint="d" coef="0.5"/></fixed></tendon>',
 )
+THREE = TENDONS.replace(
+    '<joint joint="d" coef="-2"/></fixed>',
+    '<joint joint="d" coef="-2"/><joint joint="b" coef="0.7"/></fixed>',
+)
+CABLES = """<mujoco><worldbody>
+  <body name="hub"><joint name="a" axis="0 1 0" ref="20" springdamper="0.3 0.7"/>
+    <geom type="capsule" size="0.1 0.2" pos="0.3 0 0.1"/>
+    <body name="arm" pos="0.5 0 0">
+      <joint name="b" axis="0 0 1" springref="-30" springdamper="0.2 1.5"/>
+      <joint name="c" type="slide" axis="1 0 0" springref="0.1" ref="0.3" springdamper="0 0"/>
+      <geom type="capsule" size="0.1 0.2" pos="0.3 0.1 0"/></body>
+    <body name="wrist" pos="0 0.4 0"><joint name="d" type="ball" springdamper="0.4 0.5"/>
+      <geom type="box" size="0.1 0.2 0.3" pos="0 0.1 0.2"/></body>
+  </body>
+  <body name="stone" pos="1 0 1"><freejoint name="rolls"/><geom size="0.1"/>
+    <body name="lid" pos="0 0 0.2">
+      <joint name="e" axis="1 0 0" armature="0.2" springdamper="0.1 1"/>
+      <geom type="box" size="0.1 0.1 0.02" pos="0 0.2 0"/></body></body>
+  </worldbody>
+  <tendon><fixed stiffness="30" damping="2"><joint joint="a" coef="0.4"/>
+      <joint joint="c" coef="2"/><joint joint="b" coef="-0.7"/></fixed>
+    <fixed stiffness="12" springlength="0.3"><joint joint="e" coef="0.5"/>
+      <joint joint="a" coef="-0.1"/></fixed>
+    <fixed damping="3"><joint joint="e" coef="0.5"/><joint joint="b" coef="0.25"/></fixed></tendon>
+  </mujoco>"""
 FILES = {
     "tree": TREE,
+    "cables": CABLES,
+    "three": THREE,
     "free": FREE,
     "tendons": TENDONS,
     "four_bar": FOUR_BAR,
@@ -76,7 +103,7 @@ def test_mass_matrix_and_forces_are_those_of_mujoco(name: str) -> None:
     check_dynamics(Twins(FILES[name]))
 
 
-@pytest.mark.parametrize("name", ["four_bar", "tendons", "two_loops"])
+@pytest.mark.parametrize("name", ["four_bar", "tendons", "three", "two_loops"])
 def test_residuals_of_equality_constraints_are_those_of_mujoco(name: str) -> None:
     check_residuals(Twins(FILES[name]))
 

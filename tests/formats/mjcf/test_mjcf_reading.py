@@ -122,7 +122,8 @@ FAULTS = {
     "number": (JOINT, '<joint name="j" pos="0 0"/>'),
     "axis": (JOINT, '<joint name="j" axis="0 0 0"/>'),
     "negative": (JOINT, '<joint name="j" damping="-1"/>'),
-    "spring damper": (JOINT, '<joint name="j" springdamper="1 1"/>'),
+    "spring damper": (JOINT, '<joint name="j" springdamper="1"/>'),
+    "spring damper of a free joint": (JOINT, '<joint name="j" type="free" springdamper="1 1"/>'),
     "range": (JOINT, '<joint name="j" range="1 -1"/>'),
     "class": (JOINT, '<joint name="j" class="x"/>'),
     "free": (JOINT, JOINT + "<freejoint/>"),
@@ -137,6 +138,8 @@ FAULTS = {
     "replicate without count": (JOINT, JOINT + '<replicate><geom size="1"/></replicate>'),
     "replicates": (JOINT, JOINT + '<replicate count="999">' * 3 + "</replicate>" * 3),
     "composite": (JOINT, JOINT + "<composite/>"),
+    "flexcomp": (JOINT, JOINT + "<flexcomp/>"),
+    "attach": (JOINT, JOINT + '<attach model="arm"/>'),
     "global": ("<worldbody>", '<compiler coordinate="global"/><worldbody>'),
     "order": ("<worldbody>", '<compiler eulerseq="xyw"/><worldbody>'),
     "angle": ("<worldbody>", '<compiler angle="grad"/><worldbody>'),
@@ -164,11 +167,17 @@ EQUALITIES = {
 }
 
 
-TENDON = '<tendon><fixed stiffness="2"><joint joint="j" coef="1"/></fixed></tendon>'
+TENDON = '<tendon><fixed {}><joint joint="{}" coef="{}"/></fixed></tendon>'
+TENDONS = {
+    "with dead zone": TENDON.format('stiffness="2" springlength="0 1"', "j", 1),
+    "with friction": TENDON.format('frictionloss="2"', "j", 1),
+    "on no such joint": TENDON.format('stiffness="2"', "x", 1),
+    "on no joint": TENDON.format('stiffness="2"', "j", 0),
+}
 
 
 def test_a_fault_is_named_with_its_place(tmp_path: Path) -> None:
-    texts = {"tendon whose force cannot act": file(more=TENDON)}
+    texts = {f"tendon {what}": file(more=tendon) for what, tendon in TENDONS.items()}
     for name, (old, new) in FAULTS.items():
         assert old in file()
         texts[name] = file().replace(old, new, 1)

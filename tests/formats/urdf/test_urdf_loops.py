@@ -289,6 +289,55 @@ def test_an_axis_in_the_frame_of_the_model_is_turned_into_that_of_the_joint(tmp_
 # --- couplings -----------------------------------------------------------------------------------
 
 
+NUT = """<robot name="nut">{links}
+<joint name="track" type="prismatic"><parent link="base"/><child link="slide"/>
+  <origin xyz="0 0.2 0"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/>
+</joint><joint name="spin" type="continuous"><parent link="slide"/><child link="wheel"/>
+  <origin xyz="0.1 0 0"/><axis xyz="0 1 0"/></joint>{thread}</robot>"""
+NUT_LINK = (
+    '<link name="{}"><inertial><origin xyz="0.1 0 0.05"/><mass value="1"/>'
+    '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+)
+THREAD = (
+    '<gazebo><joint name="thread" type="screw"><parent>{}</parent><child>{}</child>{}'
+    "<axis><xyz>0 1 0</xyz></axis>{}</joint></gazebo>"
+)
+
+
+@pytest.mark.parametrize(
+    ("parent", "child", "pose", "pitch"),
+    [
+        ("base", "wheel", "", "<thread_pitch>50</thread_pitch>"),
+        ("base", "wheel", "<pose>0 0.1 0 0 0 0</pose>", "<thread_pitch>50</thread_pitch>"),
+        (
+            "wheel",
+            "base",
+            "<pose>0.1 0.2 0 0 0 0</pose>",
+            f"<screw_thread_pitch>{-2.0 * np.pi / 50.0}</screw_thread_pitch>",
+        ),
+    ],
+)
+def test_a_screw_of_gazebo_goes_into_the_tree_and_what_held_its_child_is_cut(
+    parent: str, child: str, pose: str, pitch: str, tmp_path: Path
+) -> None:
+    """A nut that slides while it turns: a coupling of the two joints is the same."""
+    links = "".join(NUT_LINK.format(name) for name in ("base", "slide", "wheel"))
+    text = NUT.format(links=links, thread=THREAD.format(parent, child, pose, pitch))
+    mechanism = srm.load(write(tmp_path, text), gravity=(0.0, 9.0, 0.0))
+    assert mechanism.degrees_of_freedom == 1
+    assert names_and_types(mechanism) == [("spin", "revolute")]
+    coupled = NUT.format(links=links, thread="")
+    mimic = '<mimic joint="spin" multiplier="-0.02"/></joint><joint name="spin"'
+    reference = srm.load(
+        write(tmp_path, coupled.replace('</joint><joint name="spin"', mimic), "coupled.urdf"),
+        gravity=(0.0, 9.0, 0.0),
+    )
+    runs = [srm.simulate(m, 2.0, rtol=1e-10) for m in (mechanism, reference)]
+    track, expected = (run(2.0)[0][run.mechanism.joint("track").idx_q] for run in runs)
+    assert expected > 1e-3
+    assert track == pytest.approx(expected, rel=1e-8)
+
+
 def relation(mechanism: srm.Mechanism, q: FloatArray) -> float:
     model = mechanism.model
     return float(closure(mechanism, configuration(model, q), np.zeros(model.nv))[0])
@@ -574,11 +623,17 @@ FAULTS = {
     "gazebo joint with friction": gazebo(
         "revolute", "<axis><xyz>1 0 0</xyz><dynamics><friction>2</friction></dynamics></axis>"
     ),
+    "gazebo screw without thread": gazebo("screw", "<axis><xyz>0 1 0</xyz></axis>"),
+    "gazebo screw on the ground": gazebo(
+        "screw", "<axis><xyz>0 1 0</xyz></axis><thread_pitch>3</thread_pitch>"
+    ).replace("<parent>shin", "<parent>world"),
+    "gazebo screw of a name that is taken": gazebo("screw", "").replace('"ring"', '"hip"'),
     "gazebo joint with more": gazebo("ball", "<plugin/>"),
     "second joint with friction": second("revolute", '<dynamics friction="2"/>'),
     "second joint with armature": second("revolute", '<dynamics armature="2"/>'),
     "second joint with damping": second("spherical", '<dynamics damping="2"/>'),
-    "second joint of a screw": second("screw", '<thread_pitch value="1"/>'),
+    "second joint, two of them screws": second("screw", '<thread_pitch value="1"/>')
+    + second("screw", '<thread_pitch value="1"/>').replace('"second"', '"third"'),
     "second joint that mimics": second("revolute", '<mimic joint="hip"/>'),
     "second joint with more": second("revolute", "<play/>"),
 }

@@ -528,6 +528,15 @@ def _of_coordinate(
     direction = np.zeros(data.M.shape[0])
     direction[element.in_v] = 1.0
     angular = bool(np.abs(world_jacobian(data)[3:, element.in_v]).max() > 0.0)
+    return _along_direction(element, direction, angular)
+
+
+def _along_direction(
+    element: TorsionSpringEvaluator | LimitSpringEvaluator | CouplingSpringEvaluator,
+    direction: FloatArray,
+    angular: bool,
+) -> list[Coefficient]:
+    """The coefficients of an element that acts along one ``direction`` (nv,)."""
     return [
         Coefficient(kind, value, direction, angular)
         for kind, value in (("damping", element.damping), ("stiffness", element.stiffness))
@@ -576,7 +585,7 @@ class CouplingSpringEvaluator(LawEvaluator):
         order = np.argsort([joint.idx_v for joint in joints])
         self.in_q = np.array([joints[k].idx_q for k in order])
         self.in_v = np.array([joints[k].idx_v for k in order])
-        self.coefficients = np.array(force.coefficients)[order]
+        self.factors = np.array(force.coefficients)[order]
         self.size = model.nv
         self.stiffness, self.damping, self.rest = force.stiffness, force.damping, force.rest
 
@@ -591,7 +600,7 @@ class CouplingSpringEvaluator(LawEvaluator):
         step: BushingStep | None = None,
     ) -> FloatArray:
         """The force on the sum."""
-        rate = self.coefficients @ v[self.in_v]
+        rate = self.factors @ v[self.in_v]
         return np.array([-(self.stiffness * self._stretch(q) + self.damping * rate)])
 
     def apply(
@@ -601,20 +610,28 @@ class CouplingSpringEvaluator(LawEvaluator):
         values: FloatArray,
         step: BushingStep | None = None,
     ) -> None:
-        tau[self.in_v] += values[0] * self.coefficients
+        tau[self.in_v] += values[0] * self.factors
 
     def _stretch(self, q: FloatArray) -> float:
-        return float(self.coefficients @ q[self.in_q]) - self.rest
+        return float(self.factors @ q[self.in_q]) - self.rest
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         return 0.5 * self.stiffness * self._stretch(q) ** 2
 
-    def constants(self) -> dict[str, Any]:
+    def _along(self) -> FloatArray:
+        """The derivatives (nv,) of the sum by the coordinates."""
         along = np.zeros(self.size)
-        along[self.in_v] = self.coefficients
+        along[self.in_v] = self.factors
+        return along
+
+    def coefficients(self, data: pin.Data) -> list[Coefficient]:
+        angular = bool(np.abs(world_jacobian(data)[3:, self.in_v]).max() > 0.0)
+        return _along_direction(self, self._along(), angular)
+
+    def constants(self) -> dict[str, Any]:
         return {
             "kind": 6,
-            "support": along,
+            "support": self._along(),
             "positions": self.in_q.tolist(),
             "stiffness": self.stiffness,
             "damping": self.damping,
@@ -864,7 +881,8 @@ class ForceKinematics:
         tau = self.laws(data, q, v, step)[0]
         for element in self._elements:
             if isinstance(element, LawEvaluator):
-                element.apply(tau, data, element.laws(data, step.get(element)), step.get(element))
+                own = step.get(element)
+                element.apply(tau, data, element.laws(data, q, v, own), own)
         return tau
 
     def without_laws(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> FloatArray:

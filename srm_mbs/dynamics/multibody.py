@@ -427,12 +427,7 @@ class Mechanics(Manifold):
 
     def working_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Generalised forces (nv,) that do work: all but those of inertia and of closures."""
-        t = min(max(t, self._first), self._last)
-        force = self.applied_force(t, q, v)
-        if self._forces is not None:
-            pin.forwardKinematics(self.model, self.data, q, v)
-            pin.computeJointJacobians(self.model, self.data)
-            force = force + self._element_force(self._forces, t, q, v)
+        force = self._forces_at(t, np.concatenate([q, v]))
         gravity: FloatArray = pin.computeGeneralizedGravity(self.model, self.data, q)
         return force - gravity
 

@@ -321,7 +321,8 @@ def _with_rotors(mechanism: Mechanism) -> Mechanism:
     Damping d alone determines the motion along such a direction, as for d -> 0 of the inertia.
     """
     model, source = mechanism.model, mechanism.source
-    armature, names = np.array(model.armature), []
+    armature = np.array(model.armature)
+    names: list[str] = []
     for _ in range(model.njoints):
         path = None if source is None else source.urdf_path
         at = undetermined_joint(model, mechanism.q0, path, ROTOR_INERTIA)

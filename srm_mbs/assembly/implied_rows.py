@@ -13,11 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
-from srm_mbs.assembly.position import ClosureProblem
+from srm_mbs.assembly.position import CONSTRAINT_TOLERANCE, ClosureProblem, close_positions
 from srm_mbs.dynamics.constraints.projection import pivoted_qr
 from srm_mbs.dynamics.constraints.row_algebra import min_norm_solution
 from srm_mbs.dynamics.constraints.structure import (
@@ -43,51 +44,64 @@ WALKS, STEPS = 4, 8
 """Walks along the motion on which the implied rows are measured, and their steps."""
 
 
-def without_implied_rows(
-    mechanism: Mechanism, tolerance: float, refused: AssemblyError
-) -> tuple[Mechanism, str]:
+def without_implied_rows(mechanism: Mechanism, tolerance: float) -> tuple[Mechanism, str]:
     """The mechanism without the rows of its closures that the others imply to ``tolerance``.
 
     Parameters
     ----------
     mechanism
-        Its loops do not close exactly; q0 is the guess.
+        Its q0 is the guess.
     tolerance
-        Largest distance (m) and misalignment (rad) that may be left in the rows left out.
-    refused
-        The error of assembly, whose ``q`` is the closest configuration that was found.
+        Largest distance (m) and misalignment (rad) of the complete loops, at the closest
+        configuration and along the motion.
 
     Returns
     -------
     mechanism, note
-        The mechanism, not assembled, and a sentence about it.
+        The mechanism, not assembled, and a sentence about it; as it is, with an empty one, if no
+        rows are implied, if they are implied exactly, or if the loops are open by more.
 
     Raises
     ------
     AssemblyError
-        If the loops do not close to the tolerance; if no rows are implied; if which ones are
-        implied changes along the motion.
+        If the loops are open by more than the tolerance along the motion; if which rows are implied
+        changes along it.
     """
+    if not mechanism.loops:
+        return mechanism, ""
     problem = ClosureProblem(mechanism, mechanism.q0)
     # Data that err by the tolerance turn implied rows by as much.
     zero = max(STRUCTURAL_PIVOT, LARGEST_SHARE * tolerance / float(problem.row_unit.min()))
-    closest = _settled(problem, refused.q, zero)
-    residual = _largest(problem, closest)
-    if residual > tolerance:
-        raise _too_open(refused, residual, "the loops close", "there")
+    everything = np.arange(problem.model.nv)
+    closest = _settled(problem, close_positions(problem, mechanism.q0, everything), zero)
+    if _largest(problem, closest) > tolerance:
+        return mechanism, ""
     near = [closest, *_neighbours(problem, closest, tolerance, zero)]
     # Not normalised: rows that are all implied would be scaled up to rows like any others.
     rows = [problem.closure(q)[1] for q in near]
     ranks = [np.linalg.matrix_rank(G, rtol=zero) for G in rows]
     rank = int(max(ranks))
+    exact = CONSTRAINT_TOLERANCE * max(1.0, problem.units.length)
+    if rank == len(rows[0]) or max(_largest(problem, q) for q in near) <= exact:
+        return mechanism, ""
+    refused = partial(_refused, problem, closest)
     regular = [G for G, own in zip(rows, ranks) if own == rank]
-    if rank == len(rows[0]):
-        raise refused
-    kept = _independent_rows(regular, rank, refused)
+    kept = _independent_rows(regular, rank)
+    if kept is None:
+        raise refused(
+            "which rows of the loops follow from the others changes along the motion, so that none "
+            "can be left out",
+            "Give more digits in the file",
+        )
     reduced, left_out = _left_out(mechanism, kept)
-    worst = max(residual, *(_largest(problem, q) for q in _motion(reduced, closest, refused)))
+    worst = max(_largest(problem, q) for q in (closest, *_motion(reduced, closest)))
     if worst > tolerance:
-        raise _too_open(refused, worst, "along the motion the loops close", "there")
+        raise refused(
+            f"along the motion the loops close to {worst:.3g} (m, rad) only, more than the closing "
+            "tolerance",
+            f"Check the anchors and link lengths, or give at least {1.1 * worst:.1e} if that is "
+            "the accuracy of the file",
+        )
     return reduced, (
         f"the loops close to {worst:.1e} (m, rad) only: {', '.join(left_out)} follow from the "
         f"other rows to the closing tolerance of {tolerance:g} and are left out"
@@ -124,29 +138,20 @@ def _neighbours(
             yield found
 
 
-def _independent_rows(
-    samples: Sequence[FloatArray], rank: int, refused: AssemblyError
-) -> IndexArray:
+def _independent_rows(samples: Sequence[FloatArray], rank: int) -> IndexArray | None:
     """Indices (rank,) of rows that have the rank of all rows G (rows, nv) in every sample.
 
     Of the choices by pivoted QR in each sample, the one whose least singular value, over that of
-    all rows, is the largest.
+    all rows, is the largest; None if it is small.
     """
     weakest = [np.linalg.svd(G, compute_uv=False)[rank - 1] for G in samples]
-    best, found = 0.0, np.arange(rank)
+    best, found = WORST_CHOICE, None
     for G in samples:
         choice = np.sort(pivoted_qr(G.T)[1][:rank])
         parts = [np.linalg.svd(other[choice], compute_uv=False)[-1] for other in samples]
         worst = float(min(np.array(parts) / weakest))
         if worst > best:
             best, found = worst, choice
-    if best < WORST_CHOICE:
-        raise _explained(
-            refused,
-            "which of their rows follow from the others changes along the motion, so that none "
-            "can be left out",
-            "Give more digits in the file",
-        )
     return found
 
 
@@ -162,32 +167,20 @@ def _left_out(mechanism: Mechanism, kept: IndexArray) -> tuple[Mechanism, list[s
     return replace(mechanism, loops=tuple(loops)), left_out
 
 
-def _motion(reduced: Mechanism, start: FloatArray, refused: AssemblyError) -> Iterator[FloatArray]:
+def _motion(reduced: Mechanism, start: FloatArray) -> Iterator[FloatArray]:
     """Configurations along the motion of the ``reduced`` mechanism from ``start`` (nq,)."""
     units = coordinate_units(reduced, start, np.zeros(reduced.model.nv))
     sampler = ManifoldSampler(reduced, units)
-    closed, error = sampler.close(start)
-    if not error < STRUCTURAL_PIVOT:
-        raise refused
+    closed, _ = sampler.close(start)
     yield closed
     yield from sampler.walk(closed, np.random.default_rng(0), WALKS, STEPS)
 
 
-def _explained(refused: AssemblyError, problem: str, remedy: str) -> AssemblyError:
+def _refused(problem: ClosureProblem, q: FloatArray, why: str, remedy: str) -> AssemblyError:
     return AssemblyError(
-        problem,
-        residuals=refused.residuals,
-        q=refused.q,
-        file=refused.file,
+        why,
+        residuals=problem.loop_residuals(q),
+        q=q,
         element="closing_tolerance",
         remedy=remedy,
-    )
-
-
-def _too_open(refused: AssemblyError, residual: float, what: str, where: str) -> AssemblyError:
-    return _explained(
-        refused,
-        f"{what} to {residual:.3g} (m, rad), more than the closing tolerance",
-        f"Check the anchors and link lengths, or give at least {1.1 * residual:.1e} if that is "
-        "the accuracy of the file",
     )

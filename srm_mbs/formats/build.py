@@ -16,7 +16,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.assembly.assemble import assemble
 from srm_mbs.assembly.implied_rows import without_implied_rows
-from srm_mbs.assembly.position import limit_springs
+from srm_mbs.assembly.position import CONSTRAINT_TOLERANCE, limit_springs
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import (
     AssemblyError,
@@ -354,7 +354,9 @@ ALMOST_CLOSED = 1e-5
 def _advice(error: AssemblyError) -> str:
     """A further remedy for loops that almost close."""
     gaps = [size for pair in error.residuals.values() for size in pair if size is not None]
-    if not max(gaps, default=np.inf) < ALMOST_CLOSED:
+    if error.limits or error.element == "closing_tolerance":
+        return ""
+    if not CONSTRAINT_TOLERANCE < max(gaps, default=0.0) < ALMOST_CLOSED:
         return ""
     return (
         f". Loops that are overconstrained and close to {max(gaps):.1e} (m, rad), the accuracy of "
@@ -386,18 +388,13 @@ def assembled(reading: Reading) -> Mechanism:
     description.refuse_identical_closures()
     mechanism, q, v = unassembled(reading)
     try:
-        try:
-            mechanism = _closed(mechanism, q, v)
-        except AssemblyError as error:
-            tolerance = description.closing_tolerance
-            if not error.residuals or error.held or error.limits:
-                raise
-            if not tolerance:
-                error.remedy += _advice(error)
-                raise
-            reduced, note = without_implied_rows(mechanism, tolerance, error)
-            mechanism = _closed(replace(reduced, notes=(*reduced.notes, note)), q, v)
+        if description.closing_tolerance:
+            reduced, note = without_implied_rows(mechanism, description.closing_tolerance)
+            if note:
+                mechanism = replace(reduced, notes=(*reduced.notes, note))
+        mechanism = _closed(mechanism, q, v)
     except AssemblyError as error:
+        error.remedy += _advice(error)
         if description.lock:
             locked = ", ".join(map(repr, description.lock))
             error.remedy = f"{error.remedy}. Locked, so that they cannot help: {locked}"

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -179,6 +180,29 @@ def test_info_lists_what_is_stiff_with_coefficients_and_times() -> None:
     assert coefficient == "damping 40000 N s/m"
     assert seconds == "0.00021 s"
     assert "time constant" not in run("info", "four_bar")
+
+
+def test_massless_ends_are_treated_as_an_option_says(tmp_path: Path) -> None:
+    hinge = '<joint name="{0}" type="continuous"><parent link="{1}"/><child link="{0}"/></joint>'
+    arm = (
+        '<link name="arm"><inertial><mass value="1"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    )
+    path = tmp_path / "arm.urdf"
+    path.write_text(
+        f'<robot name="r"><link name="base"/>{arm}<link name="flag"/>'
+        f"{hinge.format('arm', 'base')}{hinge.format('flag', 'arm')}</robot>"
+    )
+    assert "--massless" in run("info", path, status=2)
+    assert "are locked (massless" in run("info", path, "--massless", "fix")
+    assert "have 0.1 kg" in run("info", path, "--massless", "0.1,1e-4")
+    assert "--massless: '1' is neither fix nor two numbers" in run(
+        "info", path, "--massless", "1", status=2
+    )
+    out = tmp_path / "out.toml"
+    run("convert", path, out, "--massless", "fix", "--closing-tolerance", "1e-8")
+    assert tomllib.loads(out.read_text())["closing_tolerance"] == 1e-8
+    assert "are locked (massless" in run("simulate", out, "--t-end", "0.01") + run("info", out)
 
 
 def test_info_of_an_open_chain_has_no_table_of_loops() -> None:

@@ -67,7 +67,7 @@ def _compiler(values: MjcfValues, node: Element) -> None:
     if given.choice("coordinate", ("local", "global")) == "global":
         raise given.fault(
             'coordinate="global" was removed from MuJoCo itself',
-            "Load the file in MuJoCo 2.3.3 or older and save it, which converts it",
+            "Convert it: load and save it in MuJoCo 2.3.3 or older",
         )
     compiler.sequence = given.text("eulerseq", compiler.sequence)
     if len(compiler.sequence) != 3 or not set(compiler.sequence) <= set("xyzXYZ"):

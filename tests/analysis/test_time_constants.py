@@ -92,6 +92,11 @@ def test_a_joint_that_a_drive_holds_has_none() -> None:
             MASS / 40.0,
         ),
         (srm.TorsionSpring("rail", 50.0, 0.0), "stiffness 50 N/m", np.sqrt(MASS / 50.0)),
+        (
+            srm.CouplingSpring(("rail",), (2.0,), damping=40.0),
+            "damping 40 N s/m",
+            MASS / 160.0,
+        ),
         (srm.LimitSpring("rail", 9.0, 40.0, upper=1.0), "damping 40 N s/m", MASS / 40.0),
     ],
     ids=lambda value: getattr(value, "type", ""),

@@ -216,6 +216,17 @@ def test_a_stiff_damper_on_several_joints_runs_alike_on_both_backends() -> None:
     np.testing.assert_allclose(lost[late][1:-1], power[late][1:-1], rtol=0.05)
 
 
+def test_a_stiff_damper_on_joints_of_a_tree_runs_alike_on_both_backends() -> None:
+    """The joints of an open chain are linearised one by one unless forces act on several."""
+    chain = srm.load("pendulum_chain")
+    cable = srm.CouplingSpring(chain.joint_names[:2], (1.0, -0.7), damping=1e5)
+    mechanism = replace(chain, forces=(cable,))
+    runs = [srm.simulate(mechanism, 1.0, rtol=1e-8, backend=b) for b in BACKENDS]
+    assert all(run.success and run.settings.stiff for run in runs)
+    assert runs[0].stats.steps == runs[1].stats.steps
+    np.testing.assert_allclose(runs[0].q[-1], runs[1].q[-1], atol=1e-8)
+
+
 def test_undamped_stiff_springs_stay_with_explicit_steps() -> None:
     """A vibration that steps have to follow is not stiff."""
     mechanism = srm.load("four_bar")

@@ -174,9 +174,9 @@ void ForceElement::check() const {
     if (curves.size() > 1) expect_size("curves", curves.size(), numbers.size());
 }
 
-bool acts_between_links(const ForceElement& e) {
+bool acts_on_several(const ForceElement& e) {
     return e.kind == ForceKind::spring_damper || e.kind == ForceKind::wrench ||
-           e.kind == ForceKind::bushing;
+           e.kind == ForceKind::bushing || e.kind == ForceKind::coupling_spring;
 }
 
 bool turns(const ForceElement& e) {

@@ -59,8 +59,8 @@ struct ForceElement {
     void check() const;
 };
 
-// Whether an element acts at points of links, not on the coordinate of a joint.
-bool acts_between_links(const ForceElement& element);
+// Whether an element acts at points of links or on several joints, not on the coordinate of one.
+bool acts_on_several(const ForceElement& element);
 
 // Whether an element is a bushing that has a moment.
 bool turns(const ForceElement& element);

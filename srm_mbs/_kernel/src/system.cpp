@@ -190,7 +190,7 @@ System::System(const void* model, SystemData data, Controller controller)
     nv = work_->model.nv;
     closed_ = data_.structural_rank > 0;
     flat_ = nq == nv;
-    between_links_ = std::any_of(data_.forces.begin(), data_.forces.end(), acts_between_links);
+    on_several_ = std::any_of(data_.forces.begin(), data_.forces.end(), acts_on_several);
     if (closed_)
         projection_ = make_projection(data_.structural_rank, data_.sigma_ref, pattern(),
                                       // A joint that mimics another adds entries off the tree.
@@ -562,7 +562,7 @@ void System::applied_forces(double t, const double* state, double* out) {
     t = std::min(std::max(t, first_), last_);
     coordinate_forces(t, state);
     if (!data_.forces.empty()) {
-        if (between_links_) {
+        if (on_several_) {
             move_bodies(state);
             pinocchio::computeJointJacobians(w.model, w.data);
         }

@@ -230,7 +230,7 @@ public:
     // All forces (nv,) but those of inertia, gravity and closures, and the values of the laws.
     void applied_forces(double t, const double* state, double* out);
     // Whether the laws, each of its own coordinate, are all that makes them depend on the state.
-    bool separate_forces() const { return !controller_ && !between_links_; }
+    bool separate_forces() const { return !controller_ && !on_several_; }
     bool has_friction() const { return !data_.friction.empty(); }
     // Error of the rate v of a coordinate from which its friction is another; infinite without.
     double friction_tolerance(int i, double v) const;
@@ -274,7 +274,7 @@ private:
     Controller controller_;
     std::unique_ptr<pinocchio_model::Workspace> work_;
     std::unique_ptr<Projection> projection_;
-    bool closed_, flat_, between_links_, predicted_ = false;
+    bool closed_, flat_, on_several_, predicted_ = false;
     std::vector<BushingStep> bushings_;  // in the step that is made
     std::vector<double> g_, bias_, pushed_, f_, v_, rate_, prediction_, white_, acted_;
 };

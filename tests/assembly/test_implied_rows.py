@@ -102,6 +102,7 @@ def test_a_tolerance_does_not_close_loops_that_are_further_apart(tmp_path: Path)
         srm.load(four_bar(tmp_path, 1e-3), closing_tolerance=1e-6)
 
 
+@pytest.mark.stress
 def test_loops_that_close_in_isolated_configurations_only_move_with_a_tolerance(
     tmp_path: Path,
 ) -> None:
@@ -118,6 +119,7 @@ def test_loops_that_close_in_isolated_configurations_only_move_with_a_tolerance(
     np.testing.assert_allclose(mechanism.q0[crank : crank + 2], [np.cos(1.0), -np.sin(1.0)])
 
 
+@pytest.mark.stress
 def test_bars_that_do_not_reach_are_no_matter_of_rounding(tmp_path: Path) -> None:
     """Crank and coupler, in line, miss a point of the ground by 1e-8 m: away from there no row
     follows from the others."""

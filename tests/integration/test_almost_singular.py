@@ -188,10 +188,11 @@ def test_dense_output_in_a_narrow_layer_has_its_rates(d: float) -> None:
     run = srm.simulate(slider_crank(d), 0.5, singular_tolerance=0.0)
     reference = Reference(d)
     t = run.crossings[0].time + np.linspace(-0.5, 0.5, 21) * np.sqrt(abs(d))
-    errors = np.array([reference.errors(*at) for at in zip(t.tolist(), *run(t))])
+    q, v = run(t)
+    errors = np.array([reference.errors(*at) for at in zip(t.tolist(), q, v)])
 
     assert errors[:, 0].max() < 1e-6
-    assert errors[:, 1].max() < 1e-4
+    assert errors[:, 1].max() < 5e-5 * np.abs(v).max()
 
 
 def test_a_saved_run_reads_the_same_within_a_passage(tmp_path: Any) -> None:

@@ -59,7 +59,7 @@ SHORTEST_PANEL = 0.1
 PANEL_ERROR = 1.0
 """Largest error of interpolation on a panel (units), over rtol.  Gauss quadrature, which leads from
 panel to panel, is far more accurate."""
-RELATIVE_PANEL_ERROR = 0.01
+RELATIVE_PANEL_ERROR = 2e-4
 """Largest one over the size of the panel: dense output shows layers that are far below rtol."""
 SHRINKAGE = 0.8
 """Ratio of the lengths that are tried."""

@@ -11,7 +11,7 @@ step by step.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -23,6 +23,7 @@ from srm_mbs.dynamics.forces import ForceKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.integration.dense_output import StepData
+from srm_mbs.model.forces import Bushing, ForceElement, SpringDamper, TorsionSpring
 
 NODES = 8
 """Gauss points per step: exact to degree 15, twice the degree of the dense output and one."""
@@ -83,6 +84,8 @@ class EnergyBalance:
 
 
 _System = OpenSystem | ClosedSystem
+LINEAR = (SpringDamper, TorsionSpring, Bushing)
+"""Elements whose force is that of a stiffness and that of a damping."""
 
 
 class BalancedRun(Protocol):
@@ -140,22 +143,38 @@ def _elements(run: BalancedRun, system: _System) -> Powers:
     mechanism = run.mechanism
     model, data = mechanism.model, workspace(mechanism.model)
     rest = np.zeros(model.nv)
-    elements = [ForceKinematics(model, [force]) for force in mechanism.forces]
-    names = [f"force {force.name}" for force in mechanism.forces]
-    powers = {name: np.zeros(len(run.t)) for name in names}
-    for i, (t, q, v) in enumerate(zip(run.t, run.q, run.v)):
-        pin.computeJointJacobians(model, data, q)
-        for velocity, sign in ((v, 1.0), (rest, -1.0)):
-            pin.forwardKinematics(model, data, q, velocity)
-            for name, force, element in zip(names, mechanism.forces, elements):
-                if sign > 0.0 or force.has_potential:
-                    powers[name][i] += sign * (element.generalised(data, q, velocity, t) @ v)
     # An undamped spring does no other work.
-    return {
-        name: powers[name]
-        for name, force in zip(names, mechanism.forces)
+    forces = [
+        force
+        for force in mechanism.forces
         if not force.has_potential or np.any(getattr(force, "damping", 1.0))
-    }
+    ]
+    moving = [
+        (f"force {force.name}", ForceKinematics(model, [_without_spring(force)]))
+        for force in forces
+    ]
+    resting = [
+        (f"force {force.name}", ForceKinematics(model, [force]))
+        for force in forces
+        if force.has_potential and not isinstance(force, LINEAR)
+    ]
+    powers = {name: np.zeros(len(run.t)) for name, _ in moving}
+    for i, (t, q, v) in enumerate(zip(run.t, run.q, run.v) if moving else ()):
+        pin.computeJointJacobians(model, data, q)
+        for velocity, sign, elements in ((v, 1.0, moving), (rest, -1.0, resting)):
+            if elements:
+                pin.forwardKinematics(model, data, q, velocity)
+            for name, element in elements:
+                powers[name][i] += sign * (element.generalised(data, q, velocity, t) @ v)
+    return powers
+
+
+def _without_spring(force: ForceElement) -> ForceElement:
+    """What is left of a linear element without its force at rest; another one itself."""
+    if not isinstance(force, LINEAR):
+        return force
+    none: Any = (0.0,) * 6 if isinstance(force, Bushing) else 0.0
+    return replace(force, stiffness=none)
 
 
 def _drives(run: BalancedRun, system: _System) -> Powers:

@@ -77,17 +77,20 @@ class Reference:
         return float(half @ (np.sqrt(mass / (2.0 * (self.energy - potential))) @ w))
 
     def error(self, solution: srm.Solution) -> float:
-        """Largest error of angles and rates at the end of a run: of the time at the angle where
-        it ended, times the rates, and of the rates there."""
-        q, v = solution.q[-1], solution.v[-1]
+        """Largest error of angles and rates at the end of a run."""
+        return max(self.errors(float(solution.t[-1]), solution.q[-1], solution.v[-1]))
+
+    def errors(self, t: float, q: Any, v: Any) -> tuple[float, float]:
+        """Error of the time at the angle at t, times the rates, and largest one of the rates
+        there."""
         angles = np.array([q[0], q[0] + q[1]])
         rates = np.array([v[0], v[0] + v[1]])
         end = angles[0 if self.by_crank else 1]
         mass, potential, slopes = self.terms(np.array(end))
         speed = self.sign * np.sqrt(2.0 * (self.energy - float(potential)) / float(mass))
         exact = speed * np.array([float(slope) for slope in slopes])
-        late = abs(self.time(float(end)) - float(solution.t[-1]))
-        return max(late * float(np.abs(exact).max()), float(np.abs(rates - exact).max()))
+        late = abs(self.time(float(end)) - t)
+        return late * float(np.abs(exact).max()), float(np.abs(rates - exact).max())
 
 
 def check(d: float, rtol: float, backend: str = "auto") -> srm.Solution:
@@ -178,6 +181,18 @@ def test_dense_output_in_the_layer_keeps_closures_and_energy() -> None:
 
     assert inside.drift[:, 0].max() < 1e-8
     assert np.abs(inside.energy - run.energy[0]).max() < 1e-5 * np.abs(run.energy[0])
+
+
+@pytest.mark.parametrize("d", [-1e-7, 1e-8, -1e-9, -1e-12])
+def test_dense_output_in_a_narrow_layer_has_its_rates(d: float) -> None:
+    run = srm.simulate(slider_crank(d), 0.5, singular_tolerance=0.0)
+    reference = Reference(d)
+    t = run.crossings[0].time + np.linspace(-0.5, 0.5, 21) * np.sqrt(abs(d))
+    q, v = run(t)
+    errors = np.array([reference.errors(*at) for at in zip(t.tolist(), q, v)])
+
+    assert errors[:, 0].max() < 1e-6
+    assert errors[:, 1].max() < 5e-5 * np.abs(v).max()
 
 
 def test_a_saved_run_reads_the_same_within_a_passage(tmp_path: Any) -> None:

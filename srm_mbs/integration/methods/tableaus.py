@@ -216,8 +216,8 @@ def _dop853() -> ButcherTableau:
         dense=dense,
         extensions={dense.name: dense},
         exact=None,
-        # Half the bound of stability, 6.1: at tight tolerances the error estimate notices the fastest
-        # mode before it grows, and steps stay below the bound.
+        # Half the bound of stability, 6.1: at tight tolerances the error estimate notices the
+        # fastest mode before it grows, and steps stay below the bound.
         stable_to=3.25,
     )
 

@@ -185,7 +185,8 @@ class ButcherTableau(_Record):
     implicit : (s, s) or None
         The g_ij of a linearly implicit scheme, lower triangular; None for explicit ones.
     stable_to
-        h |lambda| up to which an explicit scheme is stable, about; None where it is not tested.
+        h |lambda| up to which steps of an explicit scheme do not count as stiff, at most the bound
+        of its stability; None where it is not tested.
     stiff
         The scheme that takes over where the problem is stiff; None without one.
 

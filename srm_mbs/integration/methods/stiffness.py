@@ -5,8 +5,8 @@ stiff problem their arguments differ along the fastest mode, by (dq, dv), and th
 (dv, da).  With lambda the eigenvalue of the mode, |da| = |lambda| |dv| = |lambda|^2 |dq|.  Both
 ratios have to show it: a vibration that steps follow has every ratio |da| / |dv|, depending on its
 phase.
-Counted are steps with h |lambda| beyond the bound of stability (E. Hairer, G. Wanner, *Solving
-Ordinary Differential Equations II*, 2nd edition, Springer 1996, IV.2).
+Counted are steps with h |lambda| next to the bound of stability and beyond (E. Hairer, G. Wanner,
+*Solving Ordinary Differential Equations II*, 2nd edition, Springer 1996, IV.2).
 """
 
 from __future__ import annotations

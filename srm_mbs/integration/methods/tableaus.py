@@ -216,7 +216,9 @@ def _dop853() -> ButcherTableau:
         dense=dense,
         extensions={dense.name: dense},
         exact=None,
-        stable_to=6.1,
+        # Half the bound of stability, 6.1: at tight tolerances the error estimate notices the
+        # fastest mode before it grows, and steps stay below the bound.
+        stable_to=3.25,
     )
 
 

@@ -294,10 +294,11 @@ def info(
     massless: Massless = None,
     closing_tolerance: ClosingTolerance = None,
 ) -> None:
-    """Describe a mechanism: joints, loops, forces, the start, what is stiff.
+    """Describe a mechanism: joints, loops, forces, the start.
 
-    With its degrees of freedom, the rank of its closure rows, and the rows that are redundant.  Of
-    a saved run (.npz) first a summary, with the residuals of the singular configurations it met.
+    With its degrees of freedom, the rank of its closure rows, the rows that are redundant, and what
+    is stiff.  Of a saved run (.npz) first a summary, with the residuals of the singular
+    configurations it met.
     """
     from srm_mbs._kernel import missing, remedy
     from srm_mbs.analysis.summary import (

@@ -49,6 +49,7 @@ from srm_mbs.integration.kernel.system import Evaluator, shared, workspace
 from srm_mbs.integration.messages import (
     MECHANISM,
     ProblemVocabulary,
+    StopReason,
     branch_changes,
     stiffness_sentence,
 )
@@ -92,6 +93,8 @@ LONGEST_REPEATED = 2.0
 as soon again, and a longer step would be read at its beginning only."""
 SHORTEST_REPEATED = 0.1
 """That step, over the last one, below which the first step is chosen as at the start of a run."""
+STIFF_START = 1e-10
+"""First step, over the length of the run, where the start is faster than any step."""
 SMALLER_STEPS = "See solution.crossings; try a smaller rtol or step."
 """Remedy for a passage that may have changed the branch."""
 
@@ -460,9 +463,25 @@ def integrate_problem(problem: Problem) -> tuple[RunRecord, Counters, Any]:
         with (
             workspace(problem.system) if made_here else nullcontext(kernel_system) as kernel_system
         ):
-            return *_integrate(problem, kernel_system), kernel_system
+            found = _integrate(problem, kernel_system)
+            if _starts_too_fast(found[0], problem.options):
+                # The transient is too short for any step: implicit ones pass over it.
+                problem.stiff = True
+                problem.last_step = STIFF_START * (problem.options.t_end - problem.options.t0)
+                found = _integrate(problem, kernel_system)
+            return *found, kernel_system
     except (EvaluationError, ControllerError) as error:
         return failed_start(problem.options.t0, problem.state, error, " s"), (), kernel_system
+
+
+def _starts_too_fast(record: RunRecord, options: RunOptions) -> bool:
+    """Whether a run that may take implicit steps stopped because the first step that it chose is
+    below round-off."""
+    scheme = options.method.scheme
+    implicit = scheme.implicit is not None or scheme.stiff is not None
+    chosen = options.step is None and options.first_step is None
+    failed = record.stop_reason is StopReason.ROUND_OFF and not len(record.times)
+    return implicit and chosen and failed
 
 
 def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counters]:

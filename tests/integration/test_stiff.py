@@ -576,3 +576,21 @@ def test_without_damping_such_a_start_is_refused(tmp_path: Path) -> None:
     path.write_text(HEAD.format(dynamics=""))
     with pytest.raises(srm.InputError, match="the joint 'roll' moves no inertia there"):
         srm.load(path)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
+def test_a_transient_shorter_than_any_step_is_passed_over(tableau: str, backend: str) -> None:
+    """A block of 1e-24 kg, pushed with 1 N against 1 N s/m."""
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "rail")
+    inertia = pin.Inertia(1e-24, np.zeros(3), 1e-24 * np.eye(3))
+    model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
+    model.addBodyFrame("block", joint, pin.SE3.Identity(), 0)
+    model.damping = np.ones(1)
+    block = srm.Mechanism(model, forces=(srm.JointTorque("rail", 1.0),))
+    run = srm.simulate(block, 1.0, tableau=tableau, backend=backend)
+    assert end_of(run) == pytest.approx([1.0, 1.0], abs=1e-8)
+    assert run.stats.steps < 50
+    explicit = srm.simulate(block, 1.0, tableau="dop853", backend=backend)
+    assert "below the round-off" in explicit.message

@@ -170,7 +170,7 @@ def _elements(run: BalancedRun, system: _System) -> Powers:
 
 
 def _without_spring(force: ForceElement) -> ForceElement:
-    """What is left of a linear element without its force at rest; another one itself."""
+    """The damper of a linear element; of another one the element itself."""
     if not isinstance(force, LINEAR):
         return force
     none: Any = (0.0,) * 6 if isinstance(force, Bushing) else 0.0

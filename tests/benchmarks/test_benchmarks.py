@@ -203,6 +203,7 @@ def test_the_reduced_equations_of_stiff_problems_are_ours(name: str) -> None:
         assert np.abs(ours - theirs).max() < 1e-9 * (np.abs(ours).max() + 1.0)
 
 
+@pytest.mark.stress
 def test_implicit_integrators_are_measured_on_stiff_problems_alone() -> None:
     out = Results({"processor": "some"}, {"pin": pin.__version__}, {"repeats": 2})
     peers = [PEERS[name] for name in ("ours", "reduced", "reduced_radau", "mujoco")]

@@ -55,6 +55,7 @@ double initial_step(System& system, const ErrorNorm& norm, double t, const doubl
     if (!finite(rate, n) || !(largest(rate, n) < constants.rate_overflow))
         throw EvaluationError{Failure::not_finite};
     const double d1 = ErrorNorm::ratio(rate, weights.data(), n);
+    if (!std::isfinite(d1)) throw EvaluationError{Failure::not_finite};
     if (!(d1 > 0.0)) return constants.first_step_probe * span;
     const double h0 = std::min(constants.first_step_probe * d0 / d1, span);
     for (int i = 0; i < n; ++i) error[i] = h0 * rate[i];
@@ -64,6 +65,7 @@ double initial_step(System& system, const ErrorNorm& norm, double t, const doubl
     system.chart_rate(error.data(), there.data(), probed.data());
     for (int i = 0; i < n; ++i) probed[i] -= rate[i];
     const double d2 = ErrorNorm::ratio(probed.data(), weights.data(), n) / h0;
+    if (!std::isfinite(d2)) throw EvaluationError{Failure::not_finite};
     const double longest = constants.longest_first_step * h0;
     if (!(d2 > 0.0)) return std::min(longest, span);
     const double tau = d1 / d2;

@@ -131,7 +131,7 @@ def test_the_run_is_played_in_real_time_to_two_percent(page: Any, seconds: float
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("speed", ["0.25", "4"])
+@pytest.mark.parametrize("speed", ["0.25", pytest.param("4", marks=pytest.mark.stress)])
 def test_the_motion_is_played_at_the_chosen_speed_after_scrubbing(page: Any, speed: str) -> None:
     page.locator("#time").fill("2.5")
     assert page.evaluate("[animator.playing, animator.time]") == [False, 2.5]
@@ -250,7 +250,7 @@ def test_nothing_covers_the_picture_or_leaves_the_window(page: Any, size: tuple[
 @pytest.mark.parametrize(
     ("span", "panel", "clock"),
     [
-        ((5.0, 9.0), "6.000", "6.00 / 9.00 s"),
+        pytest.param((5.0, 9.0), "6.000", "6.00 / 9.00 s", marks=pytest.mark.stress),
         ((-3.0, 1.0), "\u22122.000", "\u22122.00 / 1.00 s"),
         ((0.0, 4e-6), "0.000001000", "0.00000100 / 0.00000400 s"),
     ],

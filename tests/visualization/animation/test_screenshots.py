@@ -25,8 +25,14 @@ def seen(shot: Shot, browser: Any) -> Any:
     return pixels(taken(shot, browser))
 
 
+SLOW = {"slider_crank_behind", "spatial_four_bar_bars"}
+
+
 @pytest.mark.browser
-@pytest.mark.parametrize("name", SHOTS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.stress] if n in SLOW else []) for n in SHOTS],
+)
 def test_a_run_looks_as_it_did(browser: Any, name: str) -> None:
     image = seen(SHOTS[name], browser)
     assert image.shape == (SIZE[1], SIZE[0], 3)

@@ -16,14 +16,14 @@ by Pinocchio (J. Carpentier, N. Mansard, *Analytical derivatives of rigid body d
 RSS 2018), and the forces f by one-sided differences.  Other systems are differentiated as a whole
 by such differences.
 
-**Laws of forces.**  Dampers, springs, bushings and friction act along directions N(q) that turn
-with the configuration: f = f_0(q, v, t) + N(q) y, y = F(q, v).  Evaluated at stages, a law of a
+**Laws of forces.**  Dampers, springs, bushings and friction act along directions B(q) that turn
+with the configuration: f = f_0(q, v, t) + B(q) y, y = F(q, v).  Evaluated at stages, a law of a
 large constant c errs by c h^2, and steps would shrink like c^(-1/4).  So its value y is a variable
 of its own: 0 = F(q, v) - y is linearised like the other equations (the same reference, VI.3), the
 stages evaluate the forces with their own y, and what is nonlinear no longer contains c.  With
 L = dF/d delta and W = dD/dy the full J is that with y held, plus W L; what a stage's law lacks,
 r = F - y, adds W r to the right-hand side, and the rate of y is r / (h gamma) + L (K + w) - w_y.
-More laws than degrees of freedom are one, y = M (1 - P) M^-1 N F: closures take up the rest, which
+More laws than degrees of freedom are one, y = M (1 - P) M^-1 B F: closures take up the rest, which
 may grow with c.
 
 Everything else, the correction at the end, the zone and the placement, is that of explicit steps;

@@ -85,7 +85,8 @@ def write_report(
     file = checked_path(path)
     flag(animation, "animation")
     flag(full_paths, "full_paths")
-    for kind in name_list(pictures, "pictures"):
+    pictures = name_list(pictures, "pictures")
+    for kind in pictures:
         if kind not in PICTURES:
             raise InputError(
                 f"reports have no picture of the kind {safe_repr(kind)}",

@@ -109,6 +109,17 @@ def test_the_page_is_well_formed_and_its_contents_lead_to_its_sections(page: Pag
     assert len(page.ids) == len(set(page.ids))
 
 
+@pytest.mark.parametrize(("pictures", "count"), [("sigma", 1), (np.array([]), 0)])
+def test_pictures_are_given_by_one_name_or_any_list(
+    run: srm.Solution, certificate: srm.Certificate, tmp_path: Path, pictures: Any, count: int
+) -> None:
+    run.report(
+        tmp_path / "report.html", certificate=certificate, animation=False, pictures=pictures
+    )
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert page.links.count("#pictures") == count
+
+
 def test_the_page_asks_for_nothing_from_elsewhere_and_is_small(page: Page, path: Path) -> None:
     assert all(link.startswith(("#", "data:")) for link in page.links)
     assert path.stat().st_size < 5 * MEGABYTES

@@ -151,11 +151,11 @@ class ConstraintMonitor:
         The square of the value is a parabola where the motion passes, the value itself, of
         ``power`` 1, where branches touch.
         """
-        times, squares = t.tolist(), (values**power).tolist()
+        times, heights = t.tolist(), (values**power).tolist()
         shortest = SMALLEST_REFINEMENT * (times[2] - times[0])
         for _ in range(MAX_REFINEMENTS):
             a, b, c = times
-            fa, fb, fc = squares
+            fa, fb, fc = heights
             bend = (fc - fb) / (c - b) - (fb - fa) / (b - a)
             if not bend > 0.0:
                 break
@@ -167,11 +167,11 @@ class ConstraintMonitor:
             left = new < b
             if value < fb:
                 times = [a, new, b] if left else [b, new, c]
-                squares = [fa, value, fb] if left else [fb, value, fc]
+                heights = [fa, value, fb] if left else [fb, value, fc]
             else:
                 times = [new, b, c] if left else [a, b, new]
-                squares = [value, fb, fc] if left else [fa, fb, value]
-        return times[1], float(squares[1] ** (1.0 / power))
+                heights = [value, fb, fc] if left else [fa, fb, value]
+        return times[1], float(heights[1] ** (1.0 / power))
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem
-from srm_mbs.integration.methods.touching_branches import TOUCHING, TouchingBranch
+from srm_mbs.integration.methods.touching_branches import TOUCHING, StageOnBranch, TouchingBranch
 
 BRANCH_SIGMA = 3e-3
 """sigma below which stages of a motion that lingers are solved by nodes."""
@@ -64,24 +64,8 @@ _SLOPE = np.array([-0.8, 0.8, 0.2, -0.2, -4 / 105, 4 / 105, 1 / 280, -1 / 280])
 """Weights of the slope at 0."""
 
 
-class BranchNodes:
-    """Solves stages of ``system`` by nodes of their branch.
-
-    Attributes
-    ----------
-    state : (nx,), rate : (2 nv,), multiplier : (nv,)
-        The stage on its branch, its tangent rate and its multiplier, after :meth:`solve`.
-    moved : (2 nv,)
-        What was subtracted from the stage.
-    away : (nv,)
-        The direction of the branch there, as long as nodes are apart.
-    """
-
-    state: FloatArray
-    rate: FloatArray
-    multiplier: FloatArray
-    moved: FloatArray
-    away: FloatArray
+class BranchNodes(StageOnBranch):
+    """Solves stages of ``system`` by nodes of their branch: after :meth:`solve` it is the stage."""
 
     def __init__(self, system: ClosedSystem) -> None:
         self._system = system
@@ -242,9 +226,4 @@ class StageNodes(BranchNodes):
             self._touching = TouchingBranch(self._system)
             if not self._touching.prepare(*self._start, self._rate, direction):
                 return False
-        solved = self._touching.solve(t, state)
-        if solved:
-            own = self._touching
-            self.state, self.rate, self.multiplier = own.state, own.rate, own.multiplier
-            self.moved, self.away = own.moved, own.away
-        return solved
+        return self._touching.solve(t, state, self)

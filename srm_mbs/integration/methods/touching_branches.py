@@ -69,17 +69,17 @@ def polynomial_weights(places: FloatArray) -> FloatArray:
     return weights
 
 
-class TouchingBranch:
-    """Solves stages of one step by the nodes of their branch.
+class StageOnBranch:
+    """A stage that nodes of its branch solved.
 
     Attributes
     ----------
     state : (nx,), rate : (2 nv,), multiplier : (nv,)
-        The stage on its branch, its tangent rate and its multiplier, after :meth:`solve`.
+        The stage on its branch, its tangent rate and its multiplier.
     moved : (2 nv,)
         What was subtracted from the stage.
     away : (nv,)
-        The direction of the branch there.
+        The direction of the branch there, as long as nodes are apart, or TOUCHING.
     """
 
     state: FloatArray
@@ -87,6 +87,10 @@ class TouchingBranch:
     multiplier: FloatArray
     moved: FloatArray
     away: FloatArray
+
+
+class TouchingBranch:
+    """Solves the stages of one step by the nodes of their branch."""
 
     def __init__(self, system: ClosedSystem) -> None:
         self._system = system
@@ -177,8 +181,8 @@ class TouchingBranch:
         motions = np.array([self._system.difference(state, node)[:nv] for node in self._nodes])
         return motions @ self._along, motions
 
-    def solve(self, t: float, state: FloatArray) -> bool:
-        """Solve the stage ``state`` (nx,) at t (s); whether it could be solved."""
+    def solve(self, t: float, state: FloatArray, stage: StageOnBranch) -> bool:
+        """Solve the stage ``state`` (nx,) at t (s) as ``stage``; whether it could be solved."""
         system, nv = self._system, self._system.nv
         places, motions = self._seen_from(state)
         delta = np.zeros(2 * nv)
@@ -200,9 +204,9 @@ class TouchingBranch:
         free = system.evaluate(t, on).free_acceleration()
         across = s**2 * bend
         acceleration = tangent * (float(momentum @ (free - across)) / inertia) + across
-        self.state, self.multiplier = on, free - acceleration
-        self.rate = np.concatenate([on[-nv:], acceleration])
-        self.moved = -delta
-        self.moved[nv:] = state[-nv:] - on[-nv:]
-        self.away = TOUCHING / system.position_norm(tangent) * tangent
+        stage.state, stage.multiplier = on, free - acceleration
+        stage.rate = np.concatenate([on[-nv:], acceleration])
+        stage.moved = -delta
+        stage.moved[nv:] = state[-nv:] - on[-nv:]
+        stage.away = TOUCHING / system.position_norm(tangent) * tangent
         return True

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from srm_mbs.analysis.equilibrium import Equilibrium, equilibrium
     from srm_mbs.analysis.inverse_dynamics import InverseDynamics, inverse_dynamics
     from srm_mbs.analysis.linearisation import Linearisation, linearise
+    from srm_mbs.analysis.linkage import LinkageReport, linkage_report
     from srm_mbs.analysis.path_following import FollowedPath, follow
     from srm_mbs.api import DaeSolution, Solution, load_solution, simulate, solve_dae
     from srm_mbs.assembly.assemble import Assembly, assemble
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     )
     from srm_mbs.formats.convert import convert
     from srm_mbs.formats.load import bundled_models, load, n_four_bar
+    from srm_mbs.formats.planar.linkage import Linkage, planar
     from srm_mbs.integration.kernel.backend import backend
     from srm_mbs.integration.methods.butcher import ButcherTableau
     from srm_mbs.integration.methods.psrm import PSRM
@@ -69,6 +71,7 @@ _NAMES = {
     "analysis.assembly_modes": "AssemblyMode assembly_modes",
     "analysis.equilibrium": "Equilibrium equilibrium",
     "analysis.inverse_dynamics": "InverseDynamics inverse_dynamics",
+    "analysis.linkage": "LinkageReport linkage_report",
     "analysis.linearisation": "Linearisation linearise",
     "analysis.path_following": "FollowedPath follow",
     "api": "DaeSolution Solution load_solution simulate solve_dae",
@@ -78,6 +81,7 @@ _NAMES = {
     "SrmWarning",
     "formats.convert": "convert",
     "formats.load": "bundled_models load n_four_bar",
+    "formats.planar.linkage": "Linkage planar",
     "integration.kernel.backend": "backend",
     "integration.methods.butcher": "ButcherTableau",
     "integration.methods.psrm": "PSRM",
@@ -134,6 +138,8 @@ __all__ = [
     "JointTorque",
     "LimitSpring",
     "Linearisation",
+    "Linkage",
+    "LinkageReport",
     "LiveView",
     "LoopClosure",
     "Mechanism",
@@ -166,10 +172,12 @@ __all__ = [
     "impact",
     "inverse_dynamics",
     "linearise",
+    "linkage_report",
     "load",
     "load_solution",
     "mobility_map",
     "n_four_bar",
+    "planar",
     "simulate",
     "solve_dae",
     "standard_measures",

@@ -21,6 +21,7 @@ from srm_mbs.formats.files import checked_path
 from srm_mbs.integration.driver import Tick
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.dae import SemiExplicitDAE
 from srm_mbs.model.reach import Reach
 from srm_mbs.simulation.dae_result import DaeResult
@@ -45,7 +46,14 @@ class Solution(AnimationMixin, SimulationResult):
 
         return mobility_map(self).degrees_of_freedom
 
-    def to_csv(self, path: str | Path, t: Any = None) -> None:
+    def to_csv(
+        self,
+        path: str | Path,
+        t: Any = None,
+        *,
+        points: Sequence[Anchor | str] = (),
+        reactions: bool = False,
+    ) -> None:
         """Write the motion as a table; see :mod:`srm_mbs.simulation.csv_export`.
 
         Parameters
@@ -54,10 +62,23 @@ class Solution(AnimationMixin, SimulationResult):
             File name; ``.csv`` is usual and is not added.
         t : (k,) s
             Times of its rows, in any order; by default ``solution.t``.
+        points
+            Points of links whose position, velocity and acceleration are added: anchors such as
+            ``srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))``, or names of points of the mechanism.
+        reactions
+            Whether the reactions of closures and joints are added.
+
+        Raises
+        ------
+        InputError
+            If a point does not exist; for accelerations or reactions of a loaded run that had a
+            controller.
+        OSError
+            If the file cannot be written.
         """
         from srm_mbs.simulation.csv_export import write_csv
 
-        write_csv(self if t is None else self.at(t), checked_path(path))
+        write_csv(self if t is None else self.at(t), checked_path(path), points, reactions)
 
     def save(self, path: str | Path, full_paths: bool = False) -> None:
         """Write everything needed to replay and interpolate the run, description included.
@@ -92,13 +113,19 @@ class Solution(AnimationMixin, SimulationResult):
         kind
             ``run``: drift, energy, sigma and step sizes with rejected steps and singular passages
             marked.  ``state``: positions and rates of joints.  ``balance``: energies, works, and
-            the residual of the energy balance.  ``reactions``: forces and moments in the closures.
+            the residual of the energy balance.  ``reactions``: forces and moments in closures and
+            joints.
             ``sigma``: sigma, all kinds of steps, and the error estimates.  ``phase``: rate over
-            position of joints.  ``path``: paths of points in space.
+            position of joints.  ``path``: paths of points in space.  ``point``: position, velocity
+            and acceleration of points.
         **options
-            ``joints`` of ``state`` and ``phase``: names, by default as many as fit.  ``loops`` of
-            ``reactions``: names; ``rows``: whether to draw the multiplier of each row.  ``points``
-            of ``path``: anchors such as ``srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))``.
+            ``joints`` of ``state``, ``phase`` and ``reactions``: names, by default as many as fit.
+            ``accelerations`` of ``state``: whether to draw them, too.  ``loops`` of ``reactions``:
+            names; ``rows``: whether to draw the multiplier of each row.  ``points`` of ``path`` and
+            ``point``: anchors such as ``srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))``, or names of
+            points of the mechanism.  ``x`` of ``state``, ``reactions`` and ``point``: joint on the
+            horizontal axis instead of time; ``unit``: its unit, ``"rad"`` or ``"deg"``, ``"m"`` or
+            ``"mm"``.  Of every kind ``title``: the title; ``size``: width and height (inch).
 
         Returns
         -------
@@ -144,7 +171,7 @@ class SegmentedSolution(SegmentedResult, Solution):
 class DaeSolution(DaeResult):
     """Result of :func:`solve_dae`: states and multipliers, pictures, tables."""
 
-    def plot(self, path: str | Path | None = None, kind: str = "run") -> Figure:
+    def plot(self, path: str | Path | None = None, kind: str = "run", **options: Any) -> Figure:
         """A picture of the run.
 
         Parameters
@@ -154,17 +181,19 @@ class DaeSolution(DaeResult):
             omitted.
         kind
             ``run``: drift, sigma and step sizes.  ``state``: states and multipliers.
+        **options
+            ``title``: the title; ``size``: width and height (inch).
 
         Raises
         ------
         InputError
-            For an unknown kind or suffix.
+            For an unknown kind, option or suffix.
         OSError
             If the file cannot be written.
         """
         from srm_mbs.visualization.plotting import plot_dae
 
-        return plot_dae(self, path, kind)
+        return plot_dae(self, path, kind, **options)
 
 
 SOLUTIONS = ResultTypes(Solution, SegmentedSolution)
@@ -274,8 +303,8 @@ def simulate(
     Returns
     -------
     Solution
-        With ``success`` False and everything computed so far if the run could not go on, an
-        event function that raises or returns no finite number included.
+        With ``success`` False and everything computed so far if the run could not go on; ``error``
+        is the exception of a controller, force or event function that failed during the run.
 
     Raises
     ------
@@ -283,6 +312,9 @@ def simulate(
         For invalid input, before any stepping.
     SimulationError
         Only with ``raise_on_failure``.
+    ControllerError, EventError
+        If a controller, force or event function raises, or returns another shape or numbers that
+        are not finite, at the start of the run; what it raised is the ``__cause__``.
     """
     options = locals()  # every other parameter is one
     del options["mechanism"]
@@ -372,6 +404,9 @@ def solve_dae(
         For invalid input, before any stepping.
     SimulationError
         Only with ``raise_on_failure``.
+    ControllerError, EventError
+        If a controller, force or event function raises, or returns another shape or numbers that
+        are not finite, at the start of the run; what it raised is the ``__cause__``.
     """
     options = locals()  # every other parameter is one
     for name in ("problem", "t_span", "x0"):

@@ -16,7 +16,7 @@ import unicodedata
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 __version__ = "0.1.0"
 """Version of the package; the ground layer holds it, so that every layer can name it."""
@@ -72,6 +72,16 @@ def printable(text: object, keep: str = "") -> str:
         else _SHORT.get(character) or character.encode("unicode_escape").decode("ascii")
         for character in words
     )
+
+
+Values = TypeVar("Values")
+
+
+class KnownKeys(dict[str, Values]):
+    """A table by name whose :class:`KeyError` lists the names that there are."""
+
+    def __missing__(self, key: object) -> Values:
+        raise KeyError(f"there is no {safe_repr(key)}. {known_names(self)}")
 
 
 def known_names(names: Iterable[str]) -> str:
@@ -211,7 +221,21 @@ class EvaluationError(SrmError, ArithmeticError):
     """The equations of motion could not be evaluated at one Runge-Kutta stage."""
 
 
-class ControllerError(SrmError):
+class FunctionError(SrmError):
+    """A function of the user cannot be used: it raised, or returned something else than it must.
+
+    Attributes
+    ----------
+    t
+        Time (s) of the call; None if it was not one of a controller, force or event at a state.
+    """
+
+    def __init__(self, problem: str, t: float | None = None) -> None:
+        super().__init__(problem)
+        self.t = t
+
+
+class ControllerError(FunctionError):
     """The user's controller raised, or returned something that is not a finite (nv,) vector."""
 
 
@@ -219,7 +243,7 @@ class CallbackError(ControllerError):
     """A function of a DAE raised, or returned another shape."""
 
 
-class EventError(SrmError):
+class EventError(FunctionError):
     """An event function raised, or returned something that is not one finite number."""
 
 

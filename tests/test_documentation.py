@@ -189,10 +189,10 @@ def test_the_readme_leaves_the_files_that_it_names(ran: Ran) -> None:
     assert (folder / "slider_crank.html").stat().st_size > 500_000
 
 
-def test_the_description_in_the_readme_is_the_bundled_slider_crank() -> None:
-    (shown,) = (text for language, text in blocks("README.md") if language == "toml")
-    bundled = (ROOT / "models" / "slider_crank.toml").read_text(encoding="utf-8")
-    assert tomllib.loads(shown)["loop"] == tomllib.loads(bundled)["loop"]
+def test_the_linkage_in_the_readme_turns_fully_and_is_saved(ran: Ran) -> None:
+    names, folder = ran("README.md")
+    assert np.ptp(names["run"].joint("O")[0]) == pytest.approx(6.28)
+    assert srm.load(folder / "four_bar.toml").model == names["linkage"].model
 
 
 def test_the_readme_starts_with_exactly_two_commands() -> None:

@@ -98,10 +98,12 @@ class _FixedAxesRows:
         scale = mechanism.structure.row_scale[mechanism.structure.kept]
         self._select = self._SELECT / scale[:, None]
 
-    def fill(self, rows: LoopKinematics, data: pin.Data, q: FloatArray, with_bias: bool) -> None:
+    def fill(
+        self, rows: LoopKinematics, data: pin.Data, q: FloatArray, v: FloatArray | None
+    ) -> None:
         """Put g, G and Gdot v into ``rows``."""
         points, select = self._points, self._select
-        points.update(data, q, with_bias)
+        points.update(data, q, v)
         rows.g[:], rows.G[:] = select @ points.g, select @ points.G
         rows.bias[:] = select @ points.bias
 
@@ -115,8 +117,8 @@ class Published(ClosedSystem):
         super().__init__(mechanism)
         fixed, rows = _FixedAxesRows(mechanism), self.loops
 
-        def update(data: pin.Data, q: FloatArray, with_bias: bool = True) -> None:
-            fixed.fill(rows, data, q, with_bias)
+        def update(data: pin.Data, q: FloatArray, v: FloatArray | None = None) -> None:
+            fixed.fill(rows, data, q, v)
 
         # The terms hold these rows already: they are filled differently, not replaced.
         rows.update = update  # type: ignore[method-assign]

@@ -35,7 +35,7 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     nearest_singular,
     smallest_singular_value,
 )
-from srm_mbs.errors import AnalysisError, InputError, get_logger, safe_repr
+from srm_mbs.errors import AnalysisError, InputError, KnownKeys, get_logger, safe_repr
 from srm_mbs.model.coordinates import free_coordinates, joint_coordinates
 from srm_mbs.model.numbers import name_list
 
@@ -72,6 +72,8 @@ class Equilibrium:
         The configuration, loops closed.
     multipliers : {loop: (rows,)}, reactions : {loop: (6,)}
         As ``reaction_multipliers`` and ``reactions`` of a solution, at rest.
+    joint_reactions : {joint: (6,)}
+        As ``joint_reactions`` of a solution, holding forces included.
     holding : {joint: (n,)}
         Forces (N, N m) at the held joints.
     residual
@@ -94,6 +96,7 @@ class Equilibrium:
     q: FloatArray
     multipliers: Mapping[str, FloatArray]
     reactions: Mapping[str, FloatArray]
+    joint_reactions: Mapping[str, FloatArray]
     holding: Mapping[str, FloatArray]
     residual: float
     eigenvalues: Any
@@ -396,13 +399,17 @@ def _described(
     holding[columns] = -share / geometry.unit[columns]
     system = make_system(mechanism, lambda t, q, v: holding)
     at_q = reactions_at(system, np.zeros(1), q[None], statics.rest[None])
-    wrenches, multipliers = ({name: rows[0] for name, rows in part.items()} for part in at_q)
+    multipliers, wrenches, of_joints = (
+        KnownKeys((name, rows[0]) for name, rows in part.items())
+        for part in (at_q.multipliers, at_q.closures, at_q.joints)
+    )
     joints = {name: mechanism.joint(name) for name in held}
     log.debug("%s: equilibrium of %d free directions", mechanism.name, len(values))
     return Equilibrium(
         q,
         multipliers,
         wrenches,
+        of_joints,
         {name: holding[j.idx_v : j.idx_v + j.nv] for name, j in joints.items()},
         float(np.abs(statics.force(point)).max(initial=0.0)),
         values,

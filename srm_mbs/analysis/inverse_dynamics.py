@@ -21,7 +21,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
-from srm_mbs.dynamics.constraints.reactions import reactions_at
+from srm_mbs.dynamics.constraints.reactions import Reactions, reactions_at
 from srm_mbs.dynamics.constraints.structure import structure_of
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
@@ -59,21 +59,26 @@ class InverseDynamics:
     torques: FloatArray
     power: FloatArray
     residual: FloatArray
-    _reactions: Callable[[], Any] = field(repr=False)
+    _reactions: Callable[[], Reactions] = field(repr=False)
 
     @cached_property
-    def _computed(self) -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
-        return self._reactions()  # type: ignore[no-any-return]
+    def _computed(self) -> Reactions:
+        return self._reactions()
 
     @property
     def reactions(self) -> Mapping[str, FloatArray]:
         """Per loop (n, 6), as ``solution.reactions``; computed on first use."""
-        return self._computed[0]
+        return self._computed.closures
 
     @property
     def reaction_multipliers(self) -> Mapping[str, FloatArray]:
         """Per loop (n, rows), as ``solution.reaction_multipliers``."""
-        return self._computed[1]
+        return self._computed.multipliers
+
+    @property
+    def joint_reactions(self) -> Mapping[str, FloatArray]:
+        """Per joint (n, 6), as ``solution.joint_reactions``, the actuators included."""
+        return self._computed.joints
 
 
 def _motion(
@@ -256,16 +261,12 @@ def _reactions(
     v: FloatArray,
     torques: FloatArray,
     columns: IndexArray,
-) -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
-    """Wrenches and multipliers of every loop at n states, with the forces (n, na)."""
+) -> Reactions:
+    """The reactions at n states, with the forces (n, na)."""
     acting = np.zeros(mechanism.model.nv)
     system = make_system(mechanism, lambda t, q, v: acting)
     parts = [reactions_at(system, times[:0], q[:0], v[:0])]
     for i, own in enumerate(torques):
         acting[columns] = own
         parts.append(reactions_at(system, times[i : i + 1], q[i : i + 1], v[i : i + 1]))
-    wrenches, multipliers = (
-        {name: np.concatenate([part[name] for part in of_times]) for name in of_times[0]}
-        for of_times in zip(*parts)
-    )
-    return wrenches, multipliers
+    return Reactions.joined(parts)

@@ -208,11 +208,28 @@ def loop_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str, str]]:
 def _relation(loop: LoopClosure) -> str:
     """The equation of a coupling: "first = 2 second + 0.1"."""
     (row,) = loop.rows.joint_rows
+    if loop.polynomial is not None:
+        return _polynomial_relation(loop, loop.polynomial)
     if loop.ratio is not None:
         terms = f"{row.joints[0]} = {loop.ratio:g} {row.joints[1]}"
         return f"{terms} {row.offset:+g}" if row.offset else terms
     terms = " ".join(f"{c:+g} {name}" for c, name in zip(row.coefficients, row.joints))
     return f"{terms} = {row.offset:g}"
+
+
+def _polynomial_relation(loop: LoopClosure, polynomial: Sequence[float]) -> str:
+    """The equation of a coupling by a polynomial: "first = 0.1 +2 y +3 y^2, y = second"."""
+    joints = loop.joints or ()
+    sides = ((loop.coefficients, joints[:1]), (loop.arguments, joints[1:]))
+    left, right = (
+        " ".join(names)
+        if numbers is None
+        else " ".join(f"{c:+g} {name}" for c, name in zip(numbers, joints) if c)
+        for numbers, names in sides
+    )
+    powers = ("", " y", *(f" y^{k}" for k in range(2, len(polynomial))))
+    terms = " ".join(f"{a:+g}{power}" for a, power in zip(polynomial, powers) if a)
+    return f"{left} = {terms}, y = {right}"
 
 
 def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:

@@ -1,4 +1,4 @@
-"""The commands ``modes``, ``equilibrium``, ``linearise`` and ``drag``."""
+"""The commands ``modes``, ``equilibrium``, ``linearise``, ``linkage`` and ``drag``."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import srm_mbs
+from srm_mbs.cli.model_file import ModelFile, reads_model
 from srm_mbs.cli.output import (
     HTML_SUFFIXES,
     RUN_FAILED,
-    AllowOutside,
     Html,
-    Model,
     check_output,
     echo,
     option,
@@ -73,14 +72,14 @@ def _write_page(html: Path | None, motion: Callable[[], JointMotion]) -> None:
 
 
 @reported
+@reads_model
 def modes(
-    model: Model,
+    file: ModelFile,
     hold: Hold = None,
     starts: Annotated[
         int, option("N", "Number of configurations from which closing starts.")
     ] = 200,
     seed: Annotated[int, option("N", "Seed of the random ones among them.")] = 0,
-    allow_outside: AllowOutside = False,
 ) -> None:
     """List the assembly modes, the ways in which loops close.
 
@@ -88,7 +87,7 @@ def modes(
     """
     from srm_mbs.cli.tables import mode_rows
 
-    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
+    mechanism = file.load()
     positions, names = _held(hold)
     found = srm_mbs.assembly_modes(
         mechanism,
@@ -105,13 +104,13 @@ def modes(
 
 
 @reported
+@reads_model
 def equilibrium(
-    model: Model,
+    file: ModelFile,
     hold: Hold = None,
     nearest: Annotated[
         bool, typer.Option("--nearest", help="Find the nearest one, stable or not.")
     ] = False,
-    allow_outside: AllowOutside = False,
 ) -> None:
     """Find a static equilibrium.
 
@@ -119,7 +118,7 @@ def equilibrium(
     """
     from srm_mbs.cli.tables import equilibrium_rows, position_rows
 
-    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
+    mechanism = file.load()
     positions, names = _held(hold)
     found = srm_mbs.equilibrium(
         mechanism, positions, hold=names, search="nearest" if nearest else "stable"
@@ -130,8 +129,9 @@ def equilibrium(
 
 
 @reported
+@reads_model
 def linearise(
-    model: Model,
+    file: ModelFile,
     at: Annotated[
         str,
         option(
@@ -154,7 +154,6 @@ def linearise(
         int | None, option("N", "Mode that --html shows.", min=0, show_default="0")
     ] = None,
     html: Html = None,
-    allow_outside: AllowOutside = False,
 ) -> None:
     """Linearise a mechanism: A, B, eigenvalues and mode shapes."""
     from srm_mbs.cli.tables import eigenvalue_rows, matrix_rows, state_names
@@ -167,7 +166,7 @@ def linearise(
             remedy="Give --html, or leave it out",
         )
     check_output(html, "--html", HTML_SUFFIXES)
-    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
+    mechanism = file.load()
     state = _state(mechanism, at)
     found = srm_mbs.linearise(mechanism, *state, inputs=actuated, coordinates=coordinate)
     inputs = (f"force of {name}" for name in found.inputs)
@@ -194,8 +193,34 @@ def _state(mechanism: Mechanism, at: str) -> tuple[Any, ...]:
 
 
 @reported
+@reads_model
+def linkage(
+    file: ModelFile,
+    crank: Annotated[str, option("JOINT", "Joint that drives the linkage.")],
+    plot: Annotated[
+        Path | None, option("FILE", "Draw the report over the crank as .png, .pdf or .svg.")
+    ] = None,
+) -> None:
+    """Analyse a linkage over a turn of its crank.
+
+    Prints limit positions, dead points, strokes and time ratios, and of four-bars and slider-cranks
+    the transmission angle and the Grashof class.
+    """
+    if plot is not None:
+        from srm_mbs.visualization.plotting.figure import FORMATS
+
+        check_output(plot, "--plot", FORMATS)
+    found = srm_mbs.linkage_report(file.load(), crank)
+    table(found.rows())
+    if plot is not None:
+        found.plot(plot)
+        say_written(plot)
+
+
+@reported
+@reads_model
 def drag(
-    model: Model,
+    file: ModelFile,
     values: Annotated[
         list[str],
         typer.Argument(
@@ -204,7 +229,6 @@ def drag(
     ],
     html: Html = None,
     duration: Annotated[float, option("S", "Length of the animation (s).")] = 3.0,
-    allow_outside: AllowOutside = False,
 ) -> None:
     """Drag joints through positions, on one branch.
 
@@ -213,7 +237,7 @@ def drag(
     from srm_mbs.cli.tables import path_rows, position_rows
 
     check_output(html, "--html", HTML_SUFFIXES)
-    mechanism = srm_mbs.load(model, allow_outside=allow_outside)
+    mechanism = file.load()
     targets, bare = _values(values, "JOINT=VALUE")
     if bare:
         raise InputError(

@@ -26,21 +26,16 @@ import typer
 
 import srm_mbs
 from srm_mbs.cli import analysis, playback, plot_report
+from srm_mbs.cli.model_file import ModelFile, reads_model
 from srm_mbs.cli.output import (
     BAD_INPUT,
     HTML_SUFFIXES,
     RUN_FAILED,
-    AllowOutside,
-    ClosingTolerance,
     Html,
-    Keyframe,
     Lines,
-    Massless,
-    Model,
     check_output,
     echo,
     flush_output,
-    massless_ends,
     option,
     reported,
     say,
@@ -101,8 +96,9 @@ def _global_options(
 
 @app.command()
 @reported
+@reads_model
 def simulate(
-    model: Model,
+    file: ModelFile,
     t_end: Annotated[
         float | None,
         option("S", "End of the run (s).", show_default=f"the description's, else {T_END:g}"),
@@ -153,6 +149,14 @@ def simulate(
     csv: Annotated[
         Path | None, option("FILE.csv", "Write the motion at the steps as a table.")
     ] = None,
+    points: Annotated[
+        list[str] | None,
+        several(
+            "--point",
+            playback.POINT,
+            "Add the motion of this point of a link (m, in the link's frame) to the table.",
+        ),
+    ] = None,
     html: Html = None,
     image: playback.Image = None,
     at: playback.At = None,
@@ -171,10 +175,6 @@ def simulate(
     ] = False,
     play: Annotated[bool, typer.Option("--play", help="Play the run in the browser.")] = False,
     live: playback.Live = False,
-    allow_outside: AllowOutside = False,
-    keyframe: Keyframe = None,
-    massless: Massless = None,
-    closing_tolerance: ClosingTolerance = None,
 ) -> None:
     """Simulate a mechanism and print a summary of the run.
 
@@ -182,6 +182,7 @@ def simulate(
     are written and the exit status is 1. Of an interrupted run singular passages are not counted.
     """
     from srm_mbs.analysis.summary import run_rows
+    from srm_mbs.dynamics.point_motion import place_of
     from srm_mbs.simulation.options import SINGULAR_TOLERANCE
 
     check_output(out, "--out", (".npz",))
@@ -193,15 +194,18 @@ def simulate(
     check_output(html, "--html", HTML_SUFFIXES)
     playback.check_pictures(image, at, video)
 
-    mechanism = srm_mbs.load(
-        model,
-        allow_outside=allow_outside,
-        keyframe=keyframe,
-        massless=massless_ends(massless),
-        closing_tolerance=closing_tolerance,
-    )
+    mechanism = file.load()
     overlays = playback.overlay_options(mechanism, trace, gaps, reactions)
     playback.check_overlays(trace, gaps, reactions, (html, image, video, play, live))
+    added = playback.points_or_names(points)
+    if added and csv is None:
+        raise InputError(
+            "it is added to the table of the motion, and none is asked for",
+            element="--point",
+            remedy="Give --csv too",
+        )
+    for point in added:
+        place_of(mechanism, point, "--point")
     if full_paths and out is None:
         raise InputError(
             "it is about the saved run, and none is asked for",
@@ -228,7 +232,7 @@ def simulate(
         [
             (out, partial(solution.save, full_paths=full_paths)),
             (plot, solution.plot),
-            (csv, solution.to_csv),
+            (csv, partial(solution.to_csv, points=added)),
             (html, partial(solution.export_html, **overlays)),
             (image, partial(solution.export_image, t=at, **overlays)),
             (video, partial(solution.export_video, **overlays)),
@@ -256,29 +260,19 @@ def _first(*values: float | None) -> float:
 
 @app.command()
 @reported
+@reads_model
 def convert(
-    model: Model,
+    file: ModelFile,
     out: Annotated[
         Path, typer.Argument(metavar="OUT.toml", help="The description; its URDF goes beside it.")
     ],
     cut: Annotated[list[str] | None, several("--cut", "JOINT", "Cut a loop at this joint.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
-    allow_outside: AllowOutside = False,
-    massless: Massless = None,
-    closing_tolerance: ClosingTolerance = None,
 ) -> None:
     """Write a file of any format as a TOML description and a URDF."""
     from srm_mbs.formats.convert import convert as write
 
-    *written, notes = write(
-        model,
-        out,
-        cut=cut or (),
-        force=force,
-        allow_outside=allow_outside,
-        massless=massless_ends(massless),
-        closing_tolerance=closing_tolerance,
-    )
+    *written, notes = write(file.model, out, cut=cut or (), force=force, **file.options())
     for path in written:
         say_written(path)
     for note in notes:
@@ -287,13 +281,8 @@ def convert(
 
 @app.command()
 @reported
-def info(
-    model: Model,
-    allow_outside: AllowOutside = False,
-    keyframe: Keyframe = None,
-    massless: Massless = None,
-    closing_tolerance: ClosingTolerance = None,
-) -> None:
+@reads_model
+def info(file: ModelFile) -> None:
     """Describe a mechanism: joints, loops, forces, the start.
 
     With its degrees of freedom, the rank of its closure rows, the rows that are redundant, and what
@@ -311,19 +300,13 @@ def info(
         stiff_rows,
     )
 
-    if Path(model).suffix == ".npz":
-        solution = srm_mbs.load_solution(model, allow_outside=allow_outside)
+    if Path(file.model).suffix == ".npz":
+        solution = srm_mbs.load_solution(file.model, allow_outside=file.allow_outside)
         table(run_rows(solution))
         echo("")
         mechanism = solution.mechanism
     else:
-        mechanism = srm_mbs.load(
-            model,
-            allow_outside=allow_outside,
-            keyframe=keyframe,
-            massless=massless_ends(massless),
-            closing_tolerance=closing_tolerance,
-        )
+        mechanism = file.load()
     table(mechanism_rows(mechanism))
     for header, rows in (
         (("joint", "type", "initial position", "initial rate"), joint_rows(mechanism)),
@@ -366,7 +349,7 @@ def _first_sentence(path: Path) -> str:
 
 for command in (
     *(playback.play, plot_report.plot, plot_report.report),
-    *(analysis.modes, analysis.equilibrium, analysis.linearise, analysis.drag),
+    *(analysis.modes, analysis.equilibrium, analysis.linearise, analysis.linkage, analysis.drag),
 ):
     app.command()(command)
 

@@ -47,61 +47,12 @@ def several(name: str, metavar: str, help: str, **more: Any) -> Any:
 Run = Annotated[
     Path, typer.Argument(metavar="RUN", help="A run saved with 'srm-mbs simulate --out'.")
 ]
-Model = Annotated[
-    str,
-    typer.Argument(
-        metavar="MODEL",
-        help="A bundled mechanism (see 'srm-mbs models'), a .toml description, or a file of "
-        "another format, recognised by its content (docs/formats.md).",
-    ),
-]
 Html = Annotated[Path | None, option("FILE.html", "Write the animation as one page.")]
 AllowOutside = Annotated[
     bool,
     typer.Option("--allow-outside", help="Let the file name meshes and other files anywhere."),
 ]
-Keyframe = Annotated[
-    str | None,
-    typer.Option("--keyframe", metavar="NAME", help="Start in this keyframe of an MJCF file."),
-]
-Massless = Annotated[
-    str | None,
-    option(
-        "fix|MASS,INERTIA",
-        "Moving ends without inertia: lock their joints, or give their links this inertia "
-        "(kg, kg m^2).",
-    ),
-]
-ClosingTolerance = Annotated[
-    float | None,
-    option(
-        "S",
-        "Accuracy (m, rad) of the data of overconstrained loops that do not close exactly: rows "
-        "implied to it are left out.",
-    ),
-]
 HTML_SUFFIXES = (".html", ".htm")
-
-
-def massless_ends(given: str | None) -> str | dict[str, float] | None:
-    """``--massless`` as ``srm_mbs.load`` takes it.
-
-    Raises
-    ------
-    InputError
-        If it is neither ``fix`` nor two numbers.
-    """
-    if given is None or given == "fix":
-        return given
-    try:
-        mass, inertia = map(float, given.split(","))
-    except ValueError as error:
-        raise InputError(
-            f"{given!r} is neither fix nor two numbers",
-            element="massless",
-            remedy="Give fix, or mass and moment of inertia as 0.1,1e-4 (kg, kg m^2)",
-        ) from error
-    return {"mass": mass, "inertia": inertia}
 
 
 def say(kind: str, text: object) -> None:

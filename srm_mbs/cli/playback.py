@@ -137,6 +137,18 @@ def overlay_options(
     return {"trace": anchors, "gaps": gaps, "reactions": reactions}
 
 
+def points_or_names(texts: list[str] | None) -> list[srm_mbs.Anchor | str]:
+    """The points LINK:X,Y,Z of ``--point``, and the names of points of the mechanism, which have
+    no colon.
+
+    Raises
+    ------
+    InputError
+        If one is malformed.
+    """
+    return [given_points([text], "--point")[0] if ":" in text else text for text in texts or []]
+
+
 def given_points(texts: list[str], element: str) -> list[srm_mbs.Anchor]:
     """The points LINK:X,Y,Z of the argument ``element``.
 

@@ -20,7 +20,7 @@ from srm_mbs.cli.output import (
     several,
     table,
 )
-from srm_mbs.cli.playback import POINT, given_points
+from srm_mbs.cli.playback import POINT, points_or_names
 from srm_mbs.errors import InputError
 
 
@@ -41,11 +41,12 @@ def plot(
             "KIND",
             "Kind of picture: run (drift, energy, sigma, steps), state (joints over time), "
             "balance (energies and works), reactions, sigma (with all kinds of steps), phase (rate "
-            "over position), path (of points in space).",
+            "over position), path (of points in space), point (their motion over time).",
         ),
     ] = "run",
     joints: Annotated[
-        list[str] | None, several("--joint", "NAME", "Draw this joint, with state and phase.")
+        list[str] | None,
+        several("--joint", "NAME", "Draw this joint, with state, phase and reactions."),
     ] = None,
     loops: Annotated[
         list[str] | None, several("--loop", "NAME", "Draw this closure, with reactions.")
@@ -55,7 +56,32 @@ def plot(
     ] = False,
     points: Annotated[
         list[str] | None,
-        several("--point", POINT, "Draw this point of a link (m, in the link's frame), with path."),
+        several(
+            "--point",
+            POINT,
+            "Draw this point of a link (m, in the link's frame), with path and point.",
+        ),
+    ] = None,
+    accelerations: Annotated[
+        bool, typer.Option("--accelerations", help="Draw accelerations, too, with state.")
+    ] = False,
+    x: Annotated[
+        str | None,
+        typer.Option(
+            "--x",
+            metavar="JOINT",
+            help="Draw over this joint instead of time, with state, reactions and point.",
+        ),
+    ] = None,
+    unit: Annotated[
+        str | None, option("rad|deg|m|mm", "Unit of that joint.", show_default="rad, m")
+    ] = None,
+    title: Annotated[
+        str | None, option("TEXT", "Title of the picture.", show_default="that of the run")
+    ] = None,
+    size: Annotated[
+        str | None,
+        option("WIDTH,HEIGHT", "Size of the picture (inch).", show_default="that of the kind"),
     ] = None,
 ) -> None:
     """Draw a picture of a saved run."""
@@ -66,7 +92,12 @@ def plot(
         "joints": joints,
         "loops": loops,
         "rows": rows,
-        "points": points and given_points(points, "--point"),
+        "points": points_or_names(points),
+        "accelerations": accelerations,
+        "x": x,
+        "unit": unit,
+        "title": title,
+        "size": None if size is None else size.split(","),
     }
     options = {name: value for name, value in wanted.items() if value}
     check_options(kind, options)

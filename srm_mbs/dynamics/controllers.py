@@ -76,7 +76,7 @@ def evaluate_callback(
     try:
         result = np.array(function(t, q.copy(), v.copy()), dtype=float, order="C")
     except Exception as error:
-        raise ControllerError(f"{name} raised {safe_repr(error)} at t = {t:.6g} s") from error
+        raise ControllerError(f"{name} raised {safe_repr(error)} at t = {t:.6g} s", t) from error
     if result.shape != (size,):
         problem = f"an array of shape {result.shape}"
     elif not np.isfinite(result).all():
@@ -84,5 +84,5 @@ def evaluate_callback(
     else:
         return result
     raise ControllerError(
-        f"{name} returned {problem} at t = {t:.6g} s; it must return {size} finite {values}"
+        f"{name} returned {problem} at t = {t:.6g} s; it must return {size} finite {values}", t
     )

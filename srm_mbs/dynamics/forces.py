@@ -55,6 +55,23 @@ from srm_mbs.model.laws import Law
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 
+class LinkWrench(NamedTuple):
+    """A wrench between two bodies.
+
+    Attributes
+    ----------
+    a, b
+        Joints that carry the bodies, 0 for the ground.
+    wrench : (6,)
+        Force (N) then moment (N m) about the world origin, in world axes, that acts on a; its
+        opposite acts on b.
+    """
+
+    a: int
+    b: int
+    wrench: FloatArray
+
+
 class Coefficient(NamedTuple):
     """A coefficient c of an element, and the direction n of generalised forces in which it acts
     with -c n^T v or -c n^T dq.
@@ -81,6 +98,10 @@ class Evaluator(ABC):
     @abstractmethod
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         """Add the element's generalised forces at t (s) to ``tau`` (nv,)."""
+
+    def between(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> LinkWrench | None:
+        """The wrench at t (s), if it acts between bodies; None if it acts on joint coordinates."""
+        return None
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         """Its potential energy (J), if it has one; ``data`` need hold the placements only."""
@@ -147,17 +168,16 @@ class ResolvedAnchor:
         return data.oMi[joint].act(data.v[joint]) if joint else pin.Motion.Zero()
 
 
-def add_wrench(
-    tau: FloatArray,
-    data: pin.Data,
-    support: FloatArray,
-    force: FloatArray,
-    moment: FloatArray,
-    point: FloatArray,
-) -> None:
-    """Add J^T W to ``tau`` (nv,) on the joints of ``support`` (nv,), of a force (3,) at ``point``
-    (3,) and a moment (3,), all in world axes."""
-    wrench = np.concatenate([force, moment + cross(point, force)])
+def wrench_at(point: FloatArray, force: FloatArray, moment: FloatArray | None = None) -> FloatArray:
+    """The wrench (6,) about the world origin of a force (3,) at ``point`` (3,) and a moment (3,),
+    all in world axes."""
+    about_origin = cross(point, force)
+    return np.concatenate([force, about_origin if moment is None else moment + about_origin])
+
+
+def add_wrench(tau: FloatArray, data: pin.Data, support: FloatArray, wrench: FloatArray) -> None:
+    """Add J^T W to ``tau`` (nv,) on the joints of ``support`` (nv,), of a ``wrench`` (6,) about the
+    world origin, in world axes."""
     tau += (world_jacobian(data).T @ wrench) * support
 
 
@@ -203,7 +223,11 @@ class SpringDamperEvaluator(LawEvaluator):
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         force, at_a, _ = self._force(data)
-        add_wrench(tau, data, self.support, force, np.zeros(3), at_a)
+        add_wrench(tau, data, self.support, wrench_at(at_a, force))
+
+    def between(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> LinkWrench:
+        force, at_a, _ = self._force(data)
+        return LinkWrench(self.a.joint, self.b.joint, wrench_at(at_a, force))
 
     def laws(
         self,
@@ -228,7 +252,7 @@ class SpringDamperEvaluator(LawEvaluator):
         force, at_a, line = self._force(data)
         if self.law_count:
             force = values[0] * line
-        add_wrench(tau, data, self.support, force, np.zeros(3), at_a)
+        add_wrench(tau, data, self.support, wrench_at(at_a, force))
 
     def _force(self, data: pin.Data) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Force (3,) on a, the point at which it acts, and the direction of the line."""
@@ -258,7 +282,7 @@ class SpringDamperEvaluator(LawEvaluator):
         directions = []
         for axis in [line] if self.rest_length else np.eye(3):
             directions.append(np.zeros(len(self.support)))
-            add_wrench(directions[-1], data, self.support, axis, np.zeros(3), at_a)
+            add_wrench(directions[-1], data, self.support, wrench_at(at_a, axis))
         return [
             Coefficient(kind, value, direction, angular=False)
             for kind, value in (("damping", self.damping), ("stiffness", self.stiffness))
@@ -291,12 +315,15 @@ class WrenchEvaluator(Evaluator):
         self.wrench = ValuesOverTime([*force.force, *force.moment], force.law)
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
+        add_wrench(tau, data, self.at.support, self.between(data, q, v, t).wrench)
+
+    def between(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> LinkWrench:
         at = self.at.placement(data)
         numbers = self.wrench.at(t)
         force, moment = numbers[:3], numbers[3:]
         if self.turns:
             force, moment = at.rotation @ force, at.rotation @ moment
-        add_wrench(tau, data, self.at.support, force, moment, at.translation)
+        return LinkWrench(self.at.joint, 0, wrench_at(at.translation, force, moment))
 
     def constants(self) -> dict[str, Any]:
         return {
@@ -352,6 +379,10 @@ class BushingEvaluator(LawEvaluator):
         """See :class:`Evaluator`; ``step``: to which the stage belongs."""
         self._act(tau, data, *self._forces(data, step))
 
+    def between(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> LinkWrench:
+        wrench = self._wrench(data, *self._forces(data, None))
+        return LinkWrench(self.a.joint, self.b.joint, wrench)
+
     def laws(
         self,
         data: pin.Data,
@@ -393,9 +424,15 @@ class BushingEvaluator(LawEvaluator):
         moment: FloatArray,
         L: FloatArray,
     ) -> None:
+        add_wrench(tau, data, self.support, self._wrench(data, force, moment, L))
+
+    def _wrench(
+        self, data: pin.Data, force: FloatArray, moment: FloatArray, L: FloatArray
+    ) -> FloatArray:
+        """The wrench (6,) on a of what :meth:`_forces` gives."""
         Ta, Tb = self.a.placement(data), self.b.placement(data)
         force, moment = -(Tb.rotation @ force), -(Tb.rotation @ (L @ moment))
-        add_wrench(tau, data, self.support, force, moment, Ta.translation)
+        return wrench_at(Ta.translation, force, moment)
 
     def _forces(
         self, data: pin.Data, step: BushingStep | None
@@ -690,12 +727,23 @@ class _UserForceEvaluator(Evaluator):
         self.size = model.nv if force.at is None else 6
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
-        given = evaluate_callback(self.name, self.function, self.size, "numbers", t, q, v)
+        given = self._given(q, v, t)
         if self.at is None:
             tau += given
-            return
-        at = self.at.placement(data).translation
-        add_wrench(tau, data, self.at.support, given[:3], given[3:], at)
+        else:
+            add_wrench(tau, data, self.at.support, self._wrench(self.at, data, given))
+
+    def between(self, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> LinkWrench | None:
+        if self.at is None:
+            return None
+        return LinkWrench(self.at.joint, 0, self._wrench(self.at, data, self._given(q, v, t)))
+
+    def _given(self, q: FloatArray, v: FloatArray, t: float) -> FloatArray:
+        return evaluate_callback(self.name, self.function, self.size, "numbers", t, q, v)
+
+    @staticmethod
+    def _wrench(at: ResolvedAnchor, data: pin.Data, given: FloatArray) -> FloatArray:
+        return wrench_at(at.placement(data).translation, given[:3], given[3:])
 
     def constants(self) -> None:
         return None
@@ -824,6 +872,20 @@ class ForceKinematics:
             else:
                 element.add(tau, data, q, v, t)
         return tau
+
+    def between_links(
+        self, data: pin.Data, q: FloatArray, v: FloatArray, t: float
+    ) -> list[LinkWrench]:
+        """Wrenches of the elements that act between links; ``data`` must hold placements and
+        velocities.
+
+        Raises
+        ------
+        EvaluationError, ControllerError
+            As for :meth:`generalised`.
+        """
+        found = (element.between(data, q, v, t) for element in self._elements)
+        return [wrench for wrench in found if wrench is not None]
 
     def coefficients(self, data: pin.Data) -> list[list[Coefficient]]:
         """Those of each element; ``data`` as for :meth:`generalised`."""

@@ -43,6 +43,9 @@ class Mechanism(MechanismData):
     source, defaults, notes
         Filled in by :func:`srm_mbs.load`: what the mechanism was read from, the defaults of its
         description, and what the reader should know (elements that were ignored, and why).
+    points
+        Named points of links or of the ground, by name: those of ``[points]`` of a description, and
+        of a planar linkage.
 
     Raises
     ------

@@ -559,6 +559,19 @@ def _residual_scale(mechanism: Mechanism) -> FloatArray:
     return (structure.row_scale / unit)[structure.kept]
 
 
+@per_start
+def _singularities(mechanism: Mechanism) -> SingularityAnalysis:
+    structure = mechanism.structure
+    return SingularityAnalysis(
+        mechanism.q0,
+        structure.rank,
+        structure.sigma_ref,
+        structure.units.coordinate,
+        structure.units.rate,
+        partial(geometry_of, mechanism),
+    )
+
+
 class ClosedSystem(Mechanics):
     """A mechanism with closures.  Each Pinocchio algorithm is called once per evaluation."""
 
@@ -626,18 +639,10 @@ class ClosedSystem(Mechanics):
         super().restart()
         self.projection.factorisations = 0
 
-    @cached_property
+    @property
     def singularities(self) -> SingularityAnalysis:
         """Data for the analysis of singular configurations."""
-        mechanism, structure = self.mechanism, self.structure
-        return SingularityAnalysis(
-            mechanism.q0,
-            structure.rank,
-            structure.sigma_ref,
-            structure.units.coordinate,
-            structure.units.rate,
-            partial(geometry_of, mechanism),
-        )
+        return _singularities(self.mechanism)
 
     @property
     def factorisations(self) -> int:
@@ -663,7 +668,7 @@ class ClosedSystem(Mechanics):
             f += self._element_force(self._forces, t, q, v)
         self._laws_at = q, v
         loops = self.loops
-        loops.update(data, q)
+        loops.update(data, q, v)
         loops.move_to(t)
         projection = self.projection
         threshold = None if zone is None else zone.threshold
@@ -686,7 +691,7 @@ class ClosedSystem(Mechanics):
     def derivatives(
         self, state: FloatArray, accelerations: FloatArray
     ) -> AccelerationDerivatives | None:
-        """See :class:`~srm_mbs.dynamics.system.System`: of closures of joint coordinates alone,
+        """See :class:`~srm_mbs.dynamics.system.System`: of linear closures of joint coordinates,
         whose G is constant."""
         p = self.projection
         if not self.loops.is_constant or self._joined is not None or p.rank_deficient:

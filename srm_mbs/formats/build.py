@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -180,6 +180,10 @@ class Reading:
         The texts of both.
     notes
         Sentences about approximations and ignored elements.
+    check
+        Of the assembled mechanism (:attr:`~srm_mbs.formats.translation.Translation.check`).
+    kind
+        The class of the mechanism.
     """
 
     description: Description
@@ -187,6 +191,8 @@ class Reading:
     tree: Element
     source: Source
     notes: tuple[str, ...] = ()
+    check: Callable[[Mechanism], None] | None = None
+    kind: type[Mechanism] = Mechanism
 
 
 def unassembled(
@@ -222,7 +228,7 @@ def unassembled(
     defaults = description.simulation
     csv = CsvFolder(Path(source.path).parent, source.reach) if tables else None
     friction_speed = description.friction_speed
-    mechanism = Mechanism(
+    mechanism = reading.kind(
         model,
         description.closures(),
         q0=start,
@@ -241,6 +247,7 @@ def unassembled(
             *massless,
             *_friction_note(model, friction_speed),
         ),
+        points=description.named_points(),
     )
     if description.limits == "spring":
         mechanism = _with_limit_springs(mechanism)
@@ -407,6 +414,8 @@ def assembled(reading: Reading) -> Mechanism:
         raise _in_gimbal_lock(
             source, f"the joint {mechanism.model.names[joint]!r} moves no inertia there"
         )
+    if reading.check is not None:
+        reading.check(mechanism)
     log.info(
         "%s: %d degrees of freedom, rank %d",
         mechanism.name,

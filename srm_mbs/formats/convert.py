@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 import tomli_w
 
 from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, naming
-from srm_mbs.formats.build import unassembled
+from srm_mbs.formats.build import Reading, unassembled
 from srm_mbs.formats.files import checked_path, write_texts
 from srm_mbs.formats.load import Overrides, read
 from srm_mbs.model.numbers import flag, name_list
@@ -31,6 +31,7 @@ def convert(
     force: bool = False,
     mesh_dirs: Sequence[str | Path] = (),
     allow_outside: bool = False,
+    keyframe: str | None = None,
     massless: str | Mapping[str, float] | None = None,
     closing_tolerance: float | None = None,
 ) -> tuple[Path, Path, tuple[str, ...]]:
@@ -40,7 +41,7 @@ def convert(
 
     Parameters
     ----------
-    path, cut, mesh_dirs, allow_outside, massless, closing_tolerance
+    path, cut, mesh_dirs, allow_outside, keyframe, massless, closing_tolerance
         As for :func:`srm_mbs.load`.
     out
         The description to write, ``.toml``; the URDF gets the same name with ``.urdf``.
@@ -57,31 +58,60 @@ def convert(
     InputError
         For input that cannot be read, or output that exists or cannot be written.
     """
-    description = checked_path(out, "out")
     flag(force, "force")
+    target = _description_path(out)
+    overrides = Overrides(
+        cut=name_list(cut, "cut"),
+        mesh_dirs=tuple(mesh_dirs),
+        allow_outside=allow_outside,
+        keyframe=keyframe,
+        massless=massless,
+        closing_tolerance=closing_tolerance,
+    )
+    return write_description(read(path, overrides), target, inputs=(path,), force=force)
+
+
+def _description_path(out: str | Path) -> Path:
+    """The path of a description to write; raises InputError unless its suffix is ``.toml``."""
+    description = checked_path(out, "out")
     if description.suffix.lower() != ".toml":
         raise InputError(
             f"the suffix {description.suffix!r} is not .toml",
             file=str(description),
             remedy="Use .toml",
         )
+    return description
+
+
+def write_description(
+    reading: Reading, out: str | Path, *, inputs: Sequence[str | Path] = (), force: bool = False
+) -> tuple[Path, Path, tuple[str, ...]]:
+    """Write what was read as a description, and its tree as a URDF beside it.
+
+    Parameters
+    ----------
+    reading
+        What was read; used up.
+    out, force
+        As for :func:`convert`, and so is what is returned.
+    inputs
+        Files that are not overwritten in any case, beside those of the reading.
+
+    Raises
+    ------
+    InputError
+        For output that exists or cannot be written.
+    """
+    description = _description_path(out)
     urdf = description.with_suffix(".urdf")
-    overrides = Overrides(
-        cut=name_list(cut, "cut"),
-        mesh_dirs=tuple(mesh_dirs),
-        allow_outside=allow_outside,
-        massless=massless,
-        closing_tolerance=closing_tolerance,
-    )
-    reading = read(path, overrides)
     source = reading.source
     written = _with_meshes_from(reading.tree, source.urdf, Path(source.urdf_path), urdf)
     meshes = [mesh.get("filename", "") for mesh in reading.tree.iter("mesh")]
     with naming(file=source.path):
         mechanism, _, _ = unassembled(reading)
-    inputs = {Path(name).resolve() for name in (path, source.path, source.urdf_path)}
+    kept = {Path(name).resolve() for name in (*inputs, source.path, source.urdf_path)}
     for target in (description, urdf):
-        if target.resolve() in inputs:
+        if target.resolve() in kept:
             raise InputError(
                 "it is an input of the conversion", file=str(target), remedy="Give another name"
             )

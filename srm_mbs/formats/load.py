@@ -17,7 +17,7 @@ from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError, get_logger, naming, safe_repr
 from srm_mbs.formats.build import Reading, assembled
 from srm_mbs.formats.document import Document
-from srm_mbs.formats.registry import DESCRIPTION, Format, find_format, of_key
+from srm_mbs.formats.registry import DESCRIPTION, LINKAGE, Format, find_format, of_key
 from srm_mbs.formats.toml.description import Description, check_description
 from srm_mbs.formats.translation import Options, merged
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
@@ -84,6 +84,17 @@ def _gravity(value: Any) -> tuple[float, float, float]:
     return (x, y, z)
 
 
+def _checked_base(base: Any) -> str:
+    """``base`` as the name of a root joint."""
+    if not isinstance(base, str) or base not in ROOT_JOINTS:
+        raise InputError(
+            f"there is no base {safe_repr(base)}",
+            element="base",
+            remedy=f"Known: {', '.join(ROOT_JOINTS)}",
+        )
+    return base
+
+
 def _translated(
     own: Document,
     entries: Mapping[str, Any],
@@ -101,7 +112,9 @@ def _translated(
             element="keyframe",
             remedy="Give the name of a keyframe of an MJCF file",
         )
-    options = Options(overrides.cut or tuple(description.cut), entries, reach, keyframe)
+    cut = overrides.cut or tuple(description.cut)
+    base = None if overrides.base is None else _checked_base(overrides.base)
+    options = Options(cut, entries, reach, keyframe, base, description.planar)
     translation = found.translate(model, options)
     text, given = own.text, overrides.entries()
     if translation.entries or found.key != "urdf":
@@ -112,27 +125,20 @@ def _translated(
         entries = {**entries, **given}
         description = check_description(entries, own.file)
         text = tomli_w.dumps(entries)
-    base = description.base if overrides.base is None else overrides.base
-    if not isinstance(base, str) or base not in ROOT_JOINTS:
-        raise InputError(
-            f"there is no base {safe_repr(base)}",
-            element="base",
-            remedy=f"Known: {', '.join(ROOT_JOINTS)}",
-        )
     gravity = description.gravity if overrides.gravity is None else overrides.gravity
     source = Source(
         description=text,
         urdf=translation.urdf,
         urdf_path=translation.urdf_file or model.file,
         path=own.file,
-        base=base,
+        base=description.base if base is None else base,
         gravity=_gravity(gravity),
         format=found.name,
         reach=reach,
     )
     log.debug("%s: read as %s", model.file, found.name)
     notes = (*model.notes, *translation.notes)
-    return Reading(description, entries, translation.tree, source, notes)
+    return Reading(description, entries, translation.tree, source, notes, translation.check)
 
 
 def _of_description(
@@ -140,6 +146,8 @@ def _of_description(
 ) -> Reading:
     """Read a description; its model file is read from disk unless ``urdf`` is its text."""
     description = check_description(own.toml, own.file)
+    if description.planar is not None:
+        return _translated(own, own.toml, description, LINKAGE, own, overrides, reach)
     key, name = description.model_file
     path = Path(own.file).parent / name
     if urdf is not None:
@@ -204,6 +212,19 @@ def read(name: str | Path, overrides: Overrides) -> Reading:
         return _generated(int(generated[1]), overrides)
     with naming(file=name):
         return _of_file(Path(name), overrides)
+
+
+def read_tables(entries: Mapping[str, Any], name: str) -> Reading:
+    """Read the tables of a description with a section ``[planar]``, which messages call ``name``.
+
+    Raises
+    ------
+    InputError
+        For what the tables cannot be, naming the element and the remedy.
+    """
+    own = Document("", name)
+    description = check_description(entries, name)
+    return _translated(own, entries, description, LINKAGE, own, Overrides(), Reach())
 
 
 def load(

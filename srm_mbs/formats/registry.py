@@ -16,8 +16,9 @@ from srm_mbs.formats import gepetto
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.files import shortened
 from srm_mbs.formats.mjcf import reader as mjcf
+from srm_mbs.formats.planar import reader as planar
 from srm_mbs.formats.sdf import reader as sdf
-from srm_mbs.formats.translation import Options, Translation
+from srm_mbs.formats.translation import PLANAR, Options, Translation
 from srm_mbs.formats.urdf import loops
 
 Translate = Callable[[Document, Options], Translation]
@@ -71,6 +72,8 @@ def _refuse_description(document: Document, options: Options) -> Translation:
 
 
 DESCRIPTION = Format("TOML description", (".toml",), _is_description, _refuse_description)
+LINKAGE = Format("planar linkage", (), lambda document: False, planar.translate, key=PLANAR)
+"""The section of a description that holds links and joints itself."""
 FORMATS: tuple[Format, ...] = (
     DESCRIPTION,
     Format("URDF", (".urdf",), _rooted("robot"), loops.translate, key="urdf"),

@@ -6,11 +6,13 @@ Every reader makes a :class:`Translation`; from there one path leads to the mech
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 from xml.etree.ElementTree import Element, indent, tostring
 
+from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.formats.toml.schema import PlanarEntry
 from srm_mbs.model.reach import Reach
 
 
@@ -28,12 +30,18 @@ class Options:
         Where files that the file names may lie.
     keyframe
         Name of the state of the file in which the mechanism starts; None: the pose of the file.
+    base
+        How the root link is held; None: as the description or the file says.
+    planar
+        The checked section ``[planar]`` of the description, if it has one.
     """
 
     cut: tuple[str, ...] = ()
     own: Mapping[str, Any] = field(default_factory=dict)
     reach: Reach = field(default_factory=Reach)
     keyframe: str | None = None
+    base: str | None = None
+    planar: PlanarEntry | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +63,8 @@ class Translation:
         Sentences about approximations and ignored elements, with the reason.
     urdf_file
         The file that the URDF came from, if it is another one than that translated.
+    check
+        Raises InputError if the assembled mechanism cannot be what the file is meant to describe.
     """
 
     tree: Element
@@ -62,6 +72,7 @@ class Translation:
     entries: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     urdf_file: str = ""
+    check: Callable[[Mechanism], None] | None = None
 
     def __post_init__(self) -> None:
         if not self.urdf:
@@ -80,10 +91,12 @@ class Translation:
 
 LISTS = ("lock", "loop", "force", "drive")
 """Keys whose lists in a description and in the file that it names are joined."""
-TABLES = ("simulation", "gravity_compensation")
+TABLES = ("simulation", "gravity_compensation", "points")
 """Tables that are merged key by key."""
 MODEL_KEYS = ("urdf", "sdf", "mjcf")
 """Keys of a description that name a file of another format."""
+PLANAR = "planar"
+"""Key of a description that has the links and joints in place of a file."""
 
 
 def merged(own: Mapping[str, Any], entries: Mapping[str, Any], urdf: str) -> dict[str, Any]:
@@ -98,7 +111,7 @@ def merged(own: Mapping[str, Any], entries: Mapping[str, Any], urdf: str) -> dic
     urdf
         File name of the translated URDF, written into the description.
     """
-    dropped = (*MODEL_KEYS, "format", "cut")
+    dropped = (*MODEL_KEYS, PLANAR, "format", "cut")
     out: dict[str, Any] = {"format": 1}
     if "name" in own or "name" in entries:
         out["name"] = own.get("name") or entries.get("name", "")

@@ -49,6 +49,10 @@ OPAQUE = re.compile(r"<!--|<!\[CDATA\[|<\?")
 ENDS = {"<!--": "-->", "<![CDATA[": "]]>", "<?": "?>"}
 """Of each such part, where it ends."""
 DASHES = "comments with -- inside, which XML does not allow, are skipped as tinyxml skips them"
+LATE_DECLARATION = (
+    "an XML declaration that is not at the start, which XML does not allow, is skipped"
+)
+DECLARATION = re.compile(r"<\?xml\s[^<>?]*+\?>")
 NAMESPACED = re.compile(r"\{[^}]*\}")
 
 
@@ -136,12 +140,23 @@ class XmlFile:
 
 
 class XmlValues(XmlFile):
-    """Reads values of one SDF or MJCF file, and collects notes of what it assumes or ignores."""
+    """Reads values of one SDF or MJCF file, and collects notes of what it assumes or ignores.
 
-    def __init__(self, file: str) -> None:
+    Parameters
+    ----------
+    file
+        Its name.
+    main
+        The values of the file that it is a part of: notes and counts are kept together.
+    """
+
+    def __init__(self, file: str, main: XmlValues | None = None) -> None:
         super().__init__(file)
         self._remarks: dict[str, list[str]] = {}
-        self._included = self._included_size = 0
+        self._included: list[int] = []  # characters of each included file
+        if main is not None:
+            self._remarks, self._ignored = main._remarks, main._ignored
+            self._included = main._included
 
     def remark(self, what: str, where: str) -> None:
         """Note an assumption or approximation at ``where``; one sentence lists all places."""
@@ -193,15 +208,14 @@ class XmlValues(XmlFile):
     def count_included(self, text: str, where: str) -> None:
         """Count an included file with this ``text``, and refuse it, if it is one too many or they
         are too large together."""
-        self._included += 1
-        self._included_size += len(text)
-        if self._included > MOST_INCLUDES:
+        self._included.append(len(text))
+        if len(self._included) > MOST_INCLUDES:
             raise self.fault(
                 where,
                 f"more than {MOST_INCLUDES} files are included",
                 "Include fewer, and none in a circle",
             )
-        if self._included_size > LARGEST_FILE:
+        if sum(self._included) > LARGEST_FILE:
             raise self.fault(
                 where,
                 f"the included files have more than {LARGEST_FILE / 1e6:.0f} MB together",
@@ -318,12 +332,15 @@ def parse_xml(text: str, file: str, notes: list[str] | None = None) -> Element:
         declared = _with_prefixes(text) if "unbound prefix" in str(error) else text
         if declared != text:
             return parse_xml(declared, file, notes)
-        allowed = _without_dashes(text)
-        if allowed != text:
-            root = parse_xml(allowed, file, notes)
-            if notes is not None:
-                notes.append(DASHES)
-            return root
+        for mended, note in (
+            (_without_late_declaration(text), LATE_DECLARATION),
+            (_without_dashes(text), DASHES),
+        ):
+            if mended != text:
+                root = parse_xml(mended, file, notes)
+                if notes is not None:
+                    notes.append(note)
+                return root
         raise InputError(
             f"this is not well-formed XML: {_explained(error)}",
             file=file,
@@ -402,6 +419,14 @@ def _with_prefixes(text: str) -> str:
     missing = used - set(re.findall(r"\sxmlns:([\w.-]+)\s*=", text)) - {"xml", "xmlns"}
     declarations = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in sorted(missing))
     return text[: root[1]] + declarations + text[root[1] :]
+
+
+def _without_late_declaration(text: str) -> str:
+    """``text`` with spaces for an XML declaration that follows blank lines or comments: the text is
+    decoded already, and tinyxml takes it there."""
+    root = _root(text)
+    late = DECLARATION.search(text, 1, root[1]) if root else None
+    return text if late is None else text[: late.start()] + " " * len(late[0]) + text[late.end() :]
 
 
 def _without_dashes(text: str) -> str:

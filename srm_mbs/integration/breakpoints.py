@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,11 @@ class SmoothIntervals:
         return len(self.ends)
 
 
+@lru_cache(maxsize=64)
+def _single_interval(t_end: float) -> SmoothIntervals:
+    return SmoothIntervals(np.array([t_end]), -_UNBOUNDED, _UNBOUNDED, _NONE)
+
+
 def smooth_intervals(
     times: FloatArray, marked: FloatArray, t0: float, t_end: float
 ) -> SmoothIntervals:
@@ -76,7 +82,7 @@ def smooth_intervals(
         as outside.
     """
     if not len(times) and not len(marked):
-        return SmoothIntervals(np.array([t_end]), -_UNBOUNDED, _UNBOUNDED, _NONE)
+        return _single_interval(t_end)
     order = np.concatenate([marked, times])
     is_marked = np.arange(len(order)) < len(marked)
     by_time = np.argsort(order, kind="stable")

@@ -21,11 +21,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.dynamics.observables import Observables
 from srm_mbs.dynamics.system import System, Zone
 from srm_mbs.errors import EvaluationError, InputError, safe_repr
 from srm_mbs.integration.methods.base import StepResult
@@ -272,6 +273,8 @@ class StepData:
     def __post_init__(self) -> None:
         if not len(self.stiff):
             object.__setattr__(self, "stiff", np.zeros(len(self.ranks)))
+        if not len(self.breaks):
+            object.__setattr__(self, "break_rates", np.zeros((0, len(self.end_rate))))
 
     def stage_times(self, scheme: ButcherTableau) -> FloatArray:
         """Times (n, s + 1) s of the stages and of the ends of the steps, those of ``sigmas``."""
@@ -283,7 +286,7 @@ class StepData:
     @property
     def stiff_intervals(self) -> list[tuple[float, float]]:
         """Starts and ends (s) of the intervals of stiff steps."""
-        if not self.stiff.any():
+        if not np.logical_or.reduce(self.stiff):
             return []
         edges = np.flatnonzero(np.diff(self.stiff, prepend=0.0, append=0.0)).tolist()
         return list(zip(self.times[edges[::2]].tolist(), self.times[edges[1::2]].tolist()))
@@ -434,6 +437,11 @@ class DenseOutput:
         self._smooth: dict[int, HermiteStep] = {}
         self._steps = steps
         self._extra: dict[int, FloatArray] = {}
+
+    @cached_property
+    def observables(self) -> Observables:
+        """Quantities at many states of the mechanism of the run; other systems have none."""
+        return Observables(cast(Any, self._system))
 
     def __call__(self, t: FloatArray) -> FloatArray:
         """States (k, nx) at the times ``t`` (k,), in any order.

@@ -90,6 +90,8 @@ class RunRecord:
         raised.
     message
         When, why, and what to try.
+    error
+        The exception that ended it, with its traceback; None without one.
     stop, stop_state
         Time (s) and state (nx,) where a terminal event ended the run, within the last step; None
         without one.
@@ -114,6 +116,7 @@ class RunRecord:
     status: RunStatus = RunStatus.RUNNING
     stop_reason: StopReason | None = None
     message: str = ""
+    error: BaseException | None = None
     stop: float | None = None
     stop_state: FloatArray | None = None
     wall_time: float = 0.0
@@ -140,6 +143,7 @@ class RunRecord:
             self.message = f"Interrupted at t = {t:.6g} s; everything up to there is kept."
         else:
             self.status = RunStatus.FAILED
+            self.error = error
             self.message = f"Stopped at t = {t:.6g} s: {error}. Everything up to there is kept."
 
     def mark_failed(

@@ -138,12 +138,13 @@ class EventFunction:
             value = np.asarray(found, dtype=float)
         except Exception as error:
             raise EventError(
-                f"the event {self.name} raised {safe_repr(error)} at t = {t:.6g} s"
+                f"the event {self.name} raised {safe_repr(error)} at t = {t:.6g} s", t
             ) from error
         if value.size != 1 or not np.isfinite(value).all():
             raise EventError(
                 f"the event {self.name} returned {value.tolist()} at t = {t:.6g} s; "
-                "it must return one finite number"
+                "it must return one finite number",
+                t,
             )
         return float(value.item())
 

@@ -22,6 +22,8 @@ from functools import cached_property
 import numpy as np
 
 from srm_mbs._typing import BoolArray, FloatArray
+from srm_mbs.dynamics.constraints.geometry import separated_pattern
+from srm_mbs.dynamics.constraints.row_algebra import SingularValues
 from srm_mbs.dynamics.constraints.structure import SMALL_REFERENCE_PIVOT
 from srm_mbs.dynamics.singularities.branches import branch_tangents
 from srm_mbs.dynamics.singularities.critical import CriticalConfiguration, critical_configuration
@@ -31,12 +33,12 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     analyse_singular,
     nearest_singular,
     participants,
-    smallest_singular_value,
 )
 from srm_mbs.dynamics.system import SingularityAnalysis, System
 from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
 from srm_mbs.integration.dense_output import CRITICAL, STEP_PLACEMENTS, DenseOutput, StepData
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 SLOPE_MARGIN = 1.5
 """Largest change of sigma per time between two stages, over the largest that was recorded around
@@ -98,6 +100,12 @@ SAMPLES = 21
 """Samples of the motion next to a bifurcation."""
 
 
+@per_model
+def _singular_values(mechanism: MechanismData) -> SingularValues:
+    """Those of the separated rows of closures and drives."""
+    return SingularValues(separated_pattern(mechanism))
+
+
 class ConstraintMonitor:
     """The closures and drives along the dense output of a run.
 
@@ -112,6 +120,7 @@ class ConstraintMonitor:
         self.rank = analysis.rank
         self._analysis = analysis
         self._dense = dense
+        self._values = _singular_values(self.geometry.mechanism)
 
     def states(self, t: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """(q, v) at the times t (k,)."""
@@ -123,9 +132,15 @@ class ConstraintMonitor:
 
     def smallest(self, t: FloatArray) -> FloatArray:
         """Last structural singular value of the normalised G at the times t (k,)."""
-        geometry = self.geometry
-        places = (geometry.at(q, time) for time, (q, _) in zip(t.tolist(), self.states(t)))
-        return np.array([smallest_singular_value(geometry, x, self.rank) for x in places])
+        return self._values(self.geometry.separated_rows(self._jacobians(t)), self.rank)
+
+    def normalised(self, t: FloatArray) -> FloatArray:
+        """The normalised G (k, rows, n) at the times t (k,)."""
+        return self.geometry.normalised_rows(self._jacobians(t))
+
+    def _jacobians(self, t: FloatArray) -> FloatArray:
+        q = self._dense(t)[:, : self.geometry.model.nq]
+        return self._dense.observables.jacobians(t, q)
 
     def critical(self, t: float) -> CriticalConfiguration | None:
         """The critical configuration next to the motion at t (s); None if there is none."""
@@ -443,8 +458,9 @@ def _rank_loss_cosine(
     configuration must lie close to the motion, compared with how far that moves.
     """
     geometry = monitor.geometry
-    q, q_before, q_after = (monitor.place(t) for t in (time, before, after))
+    G, G_before, G_after = monitor.normalised(np.array([time, before, after]))
     if not certain:
+        q, q_before, q_after = (monitor.place(t) for t in (time, before, after))
         found = monitor.counted_singular(time)
         if found is None:
             found = nearest_singular(geometry, q, monitor.rank, CROSSING_SEARCH)
@@ -453,13 +469,10 @@ def _rank_loss_cosine(
         moved = np.linalg.norm(geometry.difference(q_before, q_after))
         if not np.linalg.norm(geometry.difference(q, found)) < CLOSE_DISTANCE * moved:
             return None
-        q = found
-    left, size, right = np.linalg.svd(geometry.normalised(q))
+        G = geometry.normalised(found)
+    left, size, right = np.linalg.svd(G)
     rank = int(np.sum(size > max(100.0 * size[monitor.rank - 1], 1e-9)))
-    a, b = (
-        (left[:, rank:].T @ geometry.normalised(x) @ right[rank:].T).ravel()
-        for x in (q_before, q_after)
-    )
+    a, b = ((left[:, rank:].T @ other @ right[rank:].T).ravel() for other in (G_before, G_after))
     return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
 
 
@@ -549,13 +562,19 @@ def find_crossings(
     if not windows and not (steps.placements == CRITICAL).any():
         return ()
     monitor = monitor or ConstraintMonitor(analysis, dense, tolerance)
-    for begin, end, dips in windows:
-        own = slice(begin, end + 1)
-        largest = begin + int(np.argmax(sigma[own]))
-        scale = float(monitor.smallest(t[largest : largest + 1])[0])
-        for first, k, last in dips:
-            for crossing in _crossings_at(monitor, steps, t[own], (first, k, last), scale):
-                found.setdefault(crossing.time, crossing)
+    tops = [t[begin + int(np.argmax(sigma[begin : end + 1]))] for begin, end, _ in windows]
+    scales = monitor.smallest(np.array(tops)).tolist() if windows else []
+    examined = [
+        (_times_around(t[begin : end + 1], *dip, DIP_WIDTHS[0]), t[begin : end + 1], dip, scale)
+        for (begin, end, dips), scale in zip(windows, scales)
+        for dip in dips
+    ]
+    # In one call for all of them.
+    values = monitor.smallest(np.concatenate([times for times, *_ in examined] or [t[:0]]))
+    ends = np.cumsum([len(times) for times, *_ in examined])
+    for (times, window, dip, scale), own in zip(examined, np.split(values, ends[:-1])):
+        for crossing in _crossings_at(monitor, steps, window, dip, scale, times, own):
+            found.setdefault(crossing.time, crossing)
     for crossing in _crossings_along_curves(monitor, steps):
         found.setdefault(crossing.time, crossing)
     return tuple(found[time] for time in sorted(found))
@@ -567,16 +586,21 @@ def _crossings_at(
     t: FloatArray,
     dip: tuple[int, int, int],
     scale: float,
+    times: FloatArray,
+    values: FloatArray,
 ) -> list[Crossing]:
-    """The crossings at a minimum of sigma in a window with the samples t (k,); ``scale`` is the
-    largest singular value there."""
-    minima: list[tuple[int, int, int]] = []
-    for width in DIP_WIDTHS:
+    """The crossings at a minimum of sigma in a window with the samples t (k,).
+
+    ``scale``: the largest singular value there; ``values`` (n,): those at the first ``times`` (n,)
+    around the minimum.
+    """
+    minima = _minima(values, max(scale, float(values.max())))
+    for width in DIP_WIDTHS[1:]:
+        if minima:
+            break
         times = _times_around(t, *dip, width)
         values = monitor.smallest(times)
         minima = _minima(values, max(scale, float(values.max())))
-        if minima:
-            break
     found = []
     for first, k, last in minima:
         near = slice(k - 1, k + 2)
@@ -756,7 +780,9 @@ def find_bifurcations(
     analysis = system.singularities
     if analysis is None or not steps.count:
         return ()
-    if not (steps.held.any() or steps.sigmas.min() < REVERSAL_SIGMA):
+    # The reductions themselves: their methods cost more than they do in a short run.
+    near = np.minimum.reduce(steps.sigmas, axis=None) < REVERSAL_SIGMA
+    if not (near or np.logical_or.reduce(steps.held)):
         return ()
     held, last = steps.held > 0.0, steps.count - 1
     close = steps.sigmas.min(axis=1) < REVERSAL_SIGMA

@@ -177,7 +177,7 @@ def moving_joint(model: pin.Model, name: str | None, element: str) -> Any:
         About ``element`` if there is no such moving joint; the message lists those there are.
     """
     names = list(model.names)[1:]
-    if name not in names:
+    if not isinstance(name, str) or name not in names:
         raise InputError(
             f"there is no moving joint {safe_repr(name)}",
             element=element,

@@ -9,7 +9,8 @@ four kinds:
 * *distance rows*   g = |p| - L,    L a length;
 * *alignment rows*  g = n . (R u),  u constant in a, n constant in b (zero when they are
   perpendicular; used with R u close to a vector that is perpendicular to n);
-* *joint rows*      g = sum c_i q_i - s,  c_i and s constant.
+* *joint rows*      g = sum c_i q_i - s - sum a_k y^k,  k = 2, 3, ...,  y = sum b_i q_i; c_i, s, a_k
+  and b_i constant.
 
 A new type made of these is one more entry of :data:`CLOSURE_TYPES`; its Jacobian, its
 :math:`\dot G v`, its reactions and its assembly follow from the kinds of row.
@@ -54,7 +55,7 @@ _XYZ = np.eye(3)
 
 @dataclass(frozen=True)
 class JointRow:
-    """g = sum c_i q_i - offset over joints with one coordinate and one degree of freedom.
+    """g = sum c_i q_i - s - sum a_k y^k over joints with one coordinate and one degree of freedom.
 
     Attributes
     ----------
@@ -64,11 +65,26 @@ class JointRow:
         c_i; products with q_i have the unit of the offset.
     offset
         s, in the unit of the row: that of the first joint (rad or m) where c_1 is a pure number.
+    arguments
+        b_i, of y = sum b_i q_i, where there are powers; empty in a linear row.
+    powers
+        a_2, a_3, ...; empty in a linear row.
     """
 
     joints: tuple[str, ...]
     coefficients: tuple[float, ...]
     offset: float = 0.0
+    arguments: tuple[float, ...] = ()
+    powers: tuple[float, ...] = ()
+
+    def gradient(self, q: FloatArray) -> FloatArray:
+        """dg/dq_i (n, joints) at the coordinates q (n, joints)."""
+        out = np.tile(self.coefficients, (len(q), 1))
+        if self.powers:
+            b = np.array(self.arguments)
+            slope = np.polynomial.Polynomial((0.0, 0.0, *self.powers)).deriv()
+            out -= np.outer(slope(q @ b), b)
+        return out
 
 
 @dataclass(frozen=True)
@@ -253,8 +269,8 @@ _TYPES = (
         "coupling",
         ("joints",),
         _coupling,
-        "gear: a linear relation of joint coordinates",
-        ("ratio", "coefficients", "offset"),
+        "gear, cam: a linear or polynomial relation of joint coordinates",
+        ("ratio", "coefficients", "offset", "polynomial", "arguments"),
     ),
 )
 CLOSURE_TYPES: Mapping[str, ClosureType] = MappingProxyType({kind.name: kind for kind in _TYPES})
@@ -307,6 +323,12 @@ class LoopClosure:
         ``coupling`` of two joints: q_a = ratio q_b + offset, in rad or m; offset 0 by default.
     coefficients
         ``coupling`` of any number of joints, instead of ``ratio``: sum c_i q_i = offset.
+    polynomial
+        ``coupling`` of two joints, instead of ``ratio`` and ``offset``: a_0, a_1, a_2, ... of
+        q_a = a_0 + a_1 q_b + a_2 q_b^2 + ..., in rad or m.
+    arguments
+        ``polynomial`` of any number of joints: b_i of sum c_i q_i = a_0 + a_1 y + a_2 y^2 + ...
+        with y = sum b_i q_i; c_i are ``coefficients``.  Of the two numbers of a joint one may be 0.
     without
         Labels of rows that are left out, because other closures imply them; the others are as they
         are in the type.
@@ -334,6 +356,8 @@ class LoopClosure:
     ratio: float | None = _key("a ratio", '"ratio = ..."')
     coefficients: tuple[float, ...] | None = _key("coefficients", '"coefficients = [...]"')
     offset: float | None = _key("an offset", '"offset = ..."')
+    polynomial: tuple[float, ...] | None = _key("a polynomial", '"polynomial = [...]"')
+    arguments: tuple[float, ...] | None = _key("arguments", '"arguments = [...]"')
     without: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -411,13 +435,17 @@ class LoopClosure:
                 raise self._fault(
                     f"the joint {name!r} is named twice", "Keep one, with the sum of both"
                 )
+        object.__setattr__(self, "joints", joints)
+        if self.polynomial is not None or self.arguments is not None:
+            self._take_polynomial(joints)
+            return
         if (self.ratio is None) == (self.coefficients is None):
             raise self._fault(
-                "a coupling needs a ratio or coefficients"
+                "a coupling needs a ratio, coefficients or a polynomial"
                 if self.ratio is None
                 else "a coupling takes either a ratio or coefficients",
-                'Give "ratio = ..." (q_a = ratio q_b + offset) for two joints, or '
-                '"coefficients = [...]" (sum c_i q_i = offset)',
+                'Give "ratio = ..." (q_a = ratio q_b + offset) or "polynomial = [...]" for two '
+                'joints, or "coefficients = [...]" (sum c_i q_i = offset)',
             )
         if self.ratio is not None:
             if len(joints) != 2:
@@ -441,7 +469,50 @@ class LoopClosure:
             )
         offset = 0.0 if self.offset is None else self.offset
         object.__setattr__(self, "offset", finite_number(offset, "offset", self._element))
-        object.__setattr__(self, "joints", joints)
+
+    def _take_polynomial(self, joints: tuple[str, ...]) -> None:
+        if self.polynomial is None:
+            raise self._fault("arguments without a polynomial", 'Give "polynomial = [...]" as well')
+        if self.ratio is not None or self.offset:
+            raise self._fault(
+                "a polynomial takes no ratio and no offset",
+                "Give them as its first two numbers: [offset, ratio, ...]",
+            )
+        powers = finite_numbers(
+            self.polynomial,
+            len(_listed(self.polynomial)),
+            "polynomial",
+            "Give numbers: the constant, the factor of q_b, that of its square and so on",
+            self._element,
+        )
+        if not any(powers[1:]):
+            raise self._fault(
+                "the polynomial is constant", "Name the joint in lock, which holds it"
+            )
+        object.__setattr__(self, "polynomial", powers)
+        if (self.coefficients is None) != (self.arguments is None):
+            raise self._fault(
+                "a polynomial takes coefficients and arguments together, or neither",
+                "Give both, or neither for a relation of two joints",
+            )
+        if self.coefficients is None:
+            if len(joints) != 2:
+                raise self._fault(
+                    f"a polynomial relates two joints, not {len(joints)}",
+                    "Name two joints, or give coefficients and arguments",
+                )
+            return
+        sides = []
+        for key in ("coefficients", "arguments"):
+            remedy = "Give one number for each joint"
+            numbers = finite_numbers(getattr(self, key), len(joints), key, remedy, self._element)
+            object.__setattr__(self, key, numbers)
+            sides.append(numbers)
+        if not all(map(any, sides)) or not all(map(any, zip(*sides))):
+            raise self._fault(
+                "coefficients, arguments, or both numbers of a joint are zero",
+                "Give each side of the relation a joint, and remove joints that are on neither",
+            )
 
     @property
     def kind(self) -> ClosureType:
@@ -485,9 +556,20 @@ class LoopClosure:
         if self.length is not None:
             given["length"] = self.length
         if self.joints is not None:
-            coefficients = self.coefficients or (1.0, -float(self.ratio or 0.0))
-            given["joint_row"] = JointRow(self.joints, coefficients, float(self.offset or 0.0))
+            given["joint_row"] = self._joint_row(self.joints)
         return self.kind.rows(ClosureValues(**given))
+
+    def _joint_row(self, joints: tuple[str, ...]) -> JointRow:
+        """The row of a coupling, the linear part of a polynomial among its coefficients."""
+        if self.polynomial is None:
+            coefficients = self.coefficients or (1.0, -float(self.ratio or 0.0))
+            return JointRow(joints, coefficients, float(self.offset or 0.0))
+        constant, slope, *powers = (*self.polynomial, 0.0)
+        left, right = self.coefficients or (1.0, 0.0), self.arguments or (0.0, 1.0)
+        coefficients = tuple(c - slope * b for c, b in zip(left, right))
+        if not any(powers):
+            return JointRow(joints, coefficients, constant)
+        return JointRow(joints, coefficients, constant, right, tuple(powers))
 
     @property
     def row_names(self) -> tuple[str, ...]:

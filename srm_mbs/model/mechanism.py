@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import update_wrapper
 from typing import Any, Generic, Self, TypeVar
@@ -20,6 +20,7 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, known_names, safe_repr
+from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive, positions
 from srm_mbs.model.forces import ForceElement
@@ -35,6 +36,7 @@ from srm_mbs.model.validation import (
     check_tree,
     checked_elements,
     checked_friction_speed,
+    checked_points,
     checked_start,
     without,
 )
@@ -185,6 +187,7 @@ class MechanismData(ResultOwner):
     source: Source | None = None
     defaults: SimulationDefaults = field(default_factory=SimulationDefaults)
     notes: tuple[str, ...] = ()
+    points: Mapping[str, Anchor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._forget()
@@ -207,6 +210,7 @@ class MechanismData(ResultOwner):
         set_(self, "forces", checked_elements(model, "force", self.forces, "SpringDamper"))
         set_(self, "drives", checked_elements(model, "drive", self.drives, "Drive"))
         set_(self, "friction_speed", checked_friction_speed(model, self.friction_speed))
+        set_(self, "points", checked_points(model, self.points))
 
     def _forget(self) -> None:
         """Begin without results."""

@@ -14,8 +14,9 @@ from scipy.linalg.lapack import dpotrf
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, known_names, safe_repr
-from srm_mbs.model.numbers import finite_array
+from srm_mbs.errors import InputError, known_names, naming, safe_repr
+from srm_mbs.model.anchors import Anchor
+from srm_mbs.model.numbers import finite_array, named_values
 
 ARTICULATED_INERTIA_TOLERANCE = 1e-13
 """Articulated inertia, over the composite one, below which it is rounding."""
@@ -135,8 +136,9 @@ def check_tree(model: pin.Model) -> None:
         raise InputError(
             "nothing in this mechanism can move",
             element="model",
-            remedy="Give it at least one joint that is neither fixed nor locked, or load its file "
-            'with base="floating"',
+            remedy="Give it at least one joint that is neither fixed nor locked; load its file "
+            'with base="floating"; or, if its links have no inertia, with massless={"mass": ..., '
+            '"inertia": ...}',
         )
     for what, numbers in (("gravity", model.gravity.vector), ("damping", model.damping)):
         if not np.isfinite(numbers).all():
@@ -280,3 +282,26 @@ def checked_friction_speed(model: pin.Model, friction_speed: Any) -> float:
             remedy="Give the speed (rad/s, m/s) over which friction changes its sign",
         )
     return float(speed)
+
+
+def checked_points(model: pin.Model, points: Any) -> dict[str, Anchor]:
+    """The named points of a mechanism.
+
+    Raises
+    ------
+    InputError
+        Unless every name is a text and every point an anchor on a link or frame of the model.
+    """
+    found: dict[str, Anchor] = {}
+    for name, anchor in named_values(points, "points").items():
+        element = f"point {safe_repr(name)}"
+        if not isinstance(name, str) or not isinstance(anchor, Anchor):
+            raise InputError(
+                f"{safe_repr(name)}: {safe_repr(anchor)} is not a name and a point of a link",
+                element="points",
+                remedy='Give for example {"tip": srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))}',
+            )
+        with naming(element=element):
+            anchor.resolve(model)
+        found[name] = anchor
+    return found

@@ -8,10 +8,11 @@ One row per time, with a header that names each column and its unit:
 * the velocities: ``crank rate (rad/s)``, ``base.vx (m/s)``, ..., ``base.wz (rad/s)``, the latter
   in the moving body's frame;
 * with loops, the closure errors ``||g||`` and their rates ``||G v||``;
-* ``energy (J)``, kinetic plus potential.
+* ``energy (J)``, kinetic plus potential;
+* of points that are asked for, ``rod (1; 0; 0) x (m)``, ``... vx (m/s)``, ``... ax (m/s^2)``;
+* on request the reactions: ``closure pin fx (N)`` to ``mz (N m)``, and ``joint crank fx (N)``.
 
-Reactions are left out: there are six per loop, and they are better taken from
-``solution.reactions``.  Every number is written with as many digits as give the same float back.
+Every number is written with as many digits as give the same float back.
 Names and texts that a spreadsheet would take as a formula (they begin with = + - @, a tab or an
 end of line) get an apostrophe in front, which tables of laws are read without.
 """
@@ -20,7 +21,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.mobility import COMPONENTS
+from srm_mbs.dynamics.point_motion import point_name
 from srm_mbs.dynamics.scaling import is_angle, row_dimensions
 from srm_mbs.errors import get_logger
 from srm_mbs.formats.csv_table import text_cell
 from srm_mbs.formats.files import writing
+from srm_mbs.model.anchors import Anchor
 from srm_mbs.simulation.result import SimulationResult
 
 log = get_logger(__name__)
@@ -51,17 +55,35 @@ _COMPONENTS = {
 """Columns of joints of several degrees of freedom: positions, velocities."""
 
 
-def write_csv(solution: SimulationResult, path: str | Path) -> None:
+def write_csv(
+    solution: SimulationResult,
+    path: str | Path,
+    points: Sequence[Anchor | str] = (),
+    reactions: bool = False,
+) -> None:
     """Write ``solution`` at its times ``solution.t`` to ``path``; see the module's text.
+
+    Parameters
+    ----------
+    points
+        Anchors, or names of points of the mechanism, whose motion is added.
+    reactions
+        Whether the reactions of closures and joints are added.
 
     Raises
     ------
+    InputError
+        If a point does not exist; for a loaded run that had a controller.
     OSError
         If the file cannot be written.
     """
     # A state that runs away overflows in its drift and energy: "inf" or "nan" is written.
     with np.errstate(over="ignore", invalid="ignore"):
         columns = _columns(solution)
+        for point in points:
+            columns |= _motion(solution, point)
+        if reactions:
+            columns |= _wrenches(solution)
     write_table(columns, path)
 
 
@@ -88,6 +110,31 @@ def _cells(column: NDArray[Any]) -> list[Any]:
     """The values of a column as the csv module writes them; numbers stay as they are."""
     values: list[Any] = column.tolist()
     return list(map(text_cell, values)) if column.dtype.kind == "U" else values
+
+
+def _motion(solution: SimulationResult, point: Anchor | str) -> dict[str, FloatArray]:
+    """Columns of the motion of a point."""
+    motion = solution.point(point)
+    name = point_name(point).replace(",", ";")  # so that nothing is quoted
+    return {
+        f"{name} {prefix}{axis} ({unit})": values[:, k]
+        for prefix, unit, values in (
+            ("", "m", motion.position),
+            ("v", "m/s", motion.velocity),
+            ("a", "m/s^2", motion.acceleration),
+        )
+        for k, axis in enumerate("xyz")
+    }
+
+
+def _wrenches(solution: SimulationResult) -> dict[str, FloatArray]:
+    """Columns of the reactions."""
+    return {
+        f"{kind} {name} {part} ({'N' if k < 3 else 'N m'})": wrench[:, k]
+        for kind, table in (("closure", solution.reactions), ("joint", solution.joint_reactions))
+        for name, wrench in table.items()
+        for k, part in enumerate(COMPONENTS)
+    }
 
 
 def _columns(solution: SimulationResult) -> dict[str, FloatArray]:

@@ -164,6 +164,7 @@ def run_dae(
         message=record.message + method_messages(method, record.steps, norm),
         stats=statistics(system, record, data.count, len(data.zones), wrappers),
     )
+    result.error = record.error
     log_end("DAE", result)
     return finished(result, options)
 

@@ -11,22 +11,23 @@ step by step.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
 import numpy as np
-import pinocchio as pin
 
-from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
-from srm_mbs.dynamics.forces import ForceKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
+from srm_mbs.dynamics.observables import Observables
+from srm_mbs.errors import KnownKeys
 from srm_mbs.integration.dense_output import StepData
-from srm_mbs.model.forces import Bushing, ForceElement, SpringDamper, TorsionSpring
 
 NODES = 8
 """Gauss points per step: exact to degree 15, twice the degree of the dense output and one."""
+
+GAUSS = np.polynomial.legendre.leggauss(NODES)
+"""Points on [-1, 1] and weights."""
 
 RELATIVE_ROUNDING = 1e-13
 """Bound of the rounding error of a sum of energies, relative to its terms."""
@@ -84,8 +85,6 @@ class EnergyBalance:
 
 
 _System = OpenSystem | ClosedSystem
-LINEAR = (SpringDamper, TorsionSpring, Bushing)
-"""Elements whose force is that of a stiffness and that of a damping."""
 
 
 class BalancedRun(Protocol):
@@ -101,8 +100,8 @@ class BalancedRun(Protocol):
         """The accepted steps."""
 
     @property
-    def energy(self) -> FloatArray:
-        """Kinetic plus potential energy (n,) J."""
+    def observables(self) -> Observables:
+        """Quantities at many states of the mechanism."""
 
     @property
     def energy_balance(self) -> EnergyBalance:
@@ -140,41 +139,8 @@ def _joints(run: BalancedRun, system: _System) -> Powers:
 def _elements(run: BalancedRun, system: _System) -> Powers:
     """Power of force elements; of springs and bushings without their force at rest, which has a
     potential."""
-    mechanism = run.mechanism
-    model, data = mechanism.model, workspace(mechanism.model)
-    rest = np.zeros(model.nv)
-    # An undamped spring does no other work.
-    forces = [
-        force
-        for force in mechanism.forces
-        if not force.has_potential or np.any(getattr(force, "damping", 1.0))
-    ]
-    moving = [
-        (f"force {force.name}", ForceKinematics(model, [_without_spring(force)]))
-        for force in forces
-    ]
-    resting = [
-        (f"force {force.name}", ForceKinematics(model, [force]))
-        for force in forces
-        if force.has_potential and not isinstance(force, LINEAR)
-    ]
-    powers = {name: np.zeros(len(run.t)) for name, _ in moving}
-    for i, (t, q, v) in enumerate(zip(run.t, run.q, run.v) if moving else ()):
-        pin.computeJointJacobians(model, data, q)
-        for velocity, sign, elements in ((v, 1.0, moving), (rest, -1.0, resting)):
-            if elements:
-                pin.forwardKinematics(model, data, q, velocity)
-            for name, element in elements:
-                powers[name][i] += sign * (element.generalised(data, q, velocity, t) @ v)
-    return powers
-
-
-def _without_spring(force: ForceElement) -> ForceElement:
-    """The damper of a linear element; of another one the element itself."""
-    if not isinstance(force, LINEAR):
-        return force
-    none: Any = (0.0,) * 6 if isinstance(force, Bushing) else 0.0
-    return replace(force, stiffness=none)
+    powers = run.observables.powers(run.t, run.q, run.v)
+    return {f"force {name}": power for name, power in powers.items()}
 
 
 def _drives(run: BalancedRun, system: _System) -> Powers:
@@ -205,7 +171,7 @@ def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
     ends = np.unique(np.concatenate([times[times < solution.steps.end], solution.t]))
     if times[0] < ends[0]:
         ends = np.concatenate([times[:1], ends])
-    points, weights = np.polynomial.legendre.leggauss(NODES)
+    points, weights = GAUSS
     lengths = np.diff(ends)
     nodes = ends[:-1, None] + 0.5 * (points + 1.0) * lengths[:, None]
     run = solution.at(nodes.ravel())
@@ -215,19 +181,17 @@ def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
         for name, power in term(run, system).items():
             pieces = 0.5 * lengths * (power.reshape(nodes.shape) @ weights)
             works[name] = np.concatenate([[0.0], np.cumsum(pieces)])[place]
-    kinetic = np.array([system.kinetic_energy(*state) for state in zip(solution.q, solution.v)])
-    start = float(system.energy(solution.steps.states[0]))
-    return EnergyBalance(
-        solution.t,
-        kinetic,
-        solution.energy - kinetic,
-        works,
-        start,
-        _rounding(solution.mechanism, [start, *kinetic, *solution.energy]),
-    )
+    nq = solution.mechanism.model.nq
+    first = solution.steps.states[:1]
+    start = float(solution.observables.energies(first[:, :nq], first[:, nq:]).sum())
+    energies = solution.observables.energies(solution.q, solution.v)
+    kinetic, potential = energies.T
+    sums = [[start], kinetic, energies.sum(axis=1)]
+    rounding = _rounding(solution.mechanism, np.concatenate(sums))
+    return EnergyBalance(solution.t, kinetic, potential, KnownKeys(works), start, rounding)
 
 
-def _rounding(mechanism: Mechanism, energies: Sequence[float]) -> float:
+def _rounding(mechanism: Mechanism, energies: FloatArray) -> float:
     """Rounding error (J) of sums of these energies, whose zero is where potentials cancel."""
     model = mechanism.model
     mass = sum(inertia.mass for inertia in list(model.inertias)[1:])
@@ -272,7 +236,7 @@ def joined_balance(
         joined([balance.t for balance in balances]),
         joined([balance.kinetic for balance in balances]),
         joined([balance.potential for balance in balances]),
-        {name: joined(pieces) for name, pieces in rows.items()},
+        KnownKeys((name, joined(pieces)) for name, pieces in rows.items()),
         ends[0].start,
         max(balance.rounding for balance in balances),
     )

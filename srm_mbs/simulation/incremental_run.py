@@ -27,6 +27,7 @@ from srm_mbs.integration.control.step_size import (
 from srm_mbs.integration.critical_passages import CriticalPassages, examined_passages
 from srm_mbs.integration.driver import RunStatus, integrate
 from srm_mbs.integration.kernel.driver import why_stopped
+from srm_mbs.integration.kernel.marshalling import state_struct
 from srm_mbs.integration.kernel.run import CHUNK, CompiledRun, ReturnReason
 from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
@@ -177,7 +178,7 @@ class KernelRun(IncrementalRun):
             self._kernel_system,
             options.method,
             self.norm,
-            IntegratorState(nothing, 1.0, nothing),
+            state_struct(IntegratorState(nothing, 1.0, nothing)),
             np.zeros(system.nq + system.nv),
             smooth_intervals(nothing[:0], nothing[:0], 0.0, 1.0),
             step=options.step,

@@ -16,10 +16,14 @@ from numpy.typing import NDArray
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
+from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import coordinate_names
 from srm_mbs.simulation.result import SimulationResult, check_run
 from srm_mbs.simulation.segmented_result import SegmentedResult
+
+NUMBERS_AT_ONCE = 2**22
+"""Numbers of singular vectors that are held at once."""
 
 
 @dataclass(frozen=True)
@@ -114,21 +118,29 @@ def mobility_map(solution: SimulationResult) -> MobilityMap:
         )
     mechanism = solution.mechanism
     model = mechanism.model
-    geometry, everything = ClosureGeometry(mechanism, mechanism.q0), np.arange(model.nv)
-    # The last at q0, so that the arrays have their width without any time, too.
-    found = [tangent_basis(geometry, q, everything) for q in (*solution.q, mechanism.q0)]
-    bases, values = zip(*found)
-    freedom = np.array([basis.shape[1] for basis in bases[:-1]], dtype=int)
+    geometry = ClosureGeometry(mechanism, mechanism.q0)
     structural = mechanism.structure.loop_rank
-    table = np.array(values)[:-1]
-    parts = [np.linalg.norm(basis, axis=1) for basis in bases]
+    shape = len(geometry.row_unit), model.nv
+    count = len(solution.t)
+    table = np.empty((count, min(shape)))
+    rank = np.empty(count, dtype=int)
+    parts = np.empty((count, model.nv))
+    at_once = max(1, NUMBERS_AT_ONCE // max(1, sum(shape) ** 2))
+    for first in range(0, count, at_once):
+        own = slice(first, first + at_once)
+        jacobians = solution.observables.jacobians(solution.t[own], solution.q[own])
+        G = geometry.normalised_rows(jacobians[:, : shape[0], : shape[1]])  # without drives
+        _, table[own], right = np.linalg.svd(G)
+        rank[own] = (table[own] > SINGULAR).sum(axis=1)
+        free = np.arange(model.nv) >= rank[own, None]
+        parts[own] = np.sqrt(((right * free[:, :, None]) ** 2).sum(axis=1))
     return MobilityMap(
         solution.t,
-        freedom,
-        model.nv - freedom,
+        model.nv - rank,
+        rank,
         table,
-        table[:, structural - 1] if structural else np.full(len(freedom), np.inf),
-        np.array(parts)[:-1],
+        table[:, structural - 1] if structural else np.full(count, np.inf),
+        parts,
         coordinate_names(mechanism),
         solution,
     )

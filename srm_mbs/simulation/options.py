@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import lru_cache, partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -150,7 +151,7 @@ class RunOptions(NamedTuple):
 
         Results keep these, so that they hold neither progress functions nor further arrays.
         """
-        return self._replace(**_NOT_REPEATED)
+        return RunOptions._make(_REPEATABLE(self + _NOT_REPEATED))
 
 
 REPEATED = (
@@ -158,11 +159,15 @@ REPEATED = (
     *("breakpoints", "placement", "singular_times", "backend", "singular_tolerance"),
 )
 """Options that a rerun takes over; start, accuracy and output come from elsewhere."""
-_NOT_REPEATED = {
-    name: default
-    for name, default in RunOptions._field_defaults.items()
-    if name not in (*REPEATED, "lost")
-}
+_NOT_REPEATED = (None, *RunOptions._field_defaults.values())
+"""Values of the options that a rerun does not take over."""
+_REPEATABLE = itemgetter(
+    *(
+        place if name in ("t_end", *REPEATED, "lost") else place + len(RunOptions._fields)
+        for place, name in enumerate(RunOptions._fields)
+    )
+)
+"""The values of the options of a rerun, from those of a run and :data:`_NOT_REPEATED`."""
 
 
 def positive(value: Any, what: str, unit: str = "") -> float:
@@ -188,6 +193,8 @@ def checked_singular_tolerance(value: Any) -> float:
     InputError
         If it is negative or not finite.
     """
+    if type(value) is float and 0.0 <= value < math.inf:
+        return value
     number = finite_array(value, ())
     if number is None or not float(number) >= 0.0:
         raise InputError(

@@ -10,13 +10,22 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.constraints.reactions import drive_forces_at, reactions_at
-from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
+from srm_mbs.dynamics.constraints.reactions import Reactions, reactions_at
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.dynamics.observables import Observables
+from srm_mbs.dynamics.point_motion import (
+    Place,
+    PointMotion,
+    place_of,
+    point_accelerations,
+    point_positions,
+    point_velocities,
+)
+from srm_mbs.errors import InputError, KnownKeys, safe_repr
 from srm_mbs.integration.dense_output import (
     DenseOutput,
     StepData,
@@ -25,6 +34,7 @@ from srm_mbs.integration.dense_output import (
 )
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import Occurrence
+from srm_mbs.integration.kernel.observables import CompiledObservables
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.singular_passages import (
     Bifurcation,
@@ -32,6 +42,7 @@ from srm_mbs.integration.singular_passages import (
     find_bifurcations,
     find_crossings,
 )
+from srm_mbs.model.anchors import Anchor
 from srm_mbs.simulation.energy_balance import EnergyBalance, energy_balance
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.streamed_output import StreamedOutput
@@ -109,6 +120,9 @@ class RunOutcome:
         The rejected and redone ones: a structured array of :data:`ATTEMPT`.
     status, message
         ``finished``, ``event`` (a terminal event), ``failed`` or ``interrupted``; when and why.
+    error
+        The exception that ended a failed run, with its traceback and, as its ``__cause__``, what a
+        function of the user raised; None without one, and for a loaded run.
     stats, settings
         :class:`Statistics` and :class:`Settings`.
     """
@@ -117,6 +131,7 @@ class RunOutcome:
     attempts: NDArray[np.void]
     status: RunStatus
     message: str
+    error: BaseException | None = None
     stats: Statistics
     settings: Settings
 
@@ -294,6 +309,12 @@ class SimulationResult(RunOutcome):
         """The equations of motion of the run."""
         return self._system
 
+    @cached_property
+    def observables(self) -> Observables:
+        """Quantities at many states of the mechanism, by the backend of the run."""
+        by_kernel = self.settings.backend == "kernel" and core is not None
+        return (CompiledObservables if by_kernel else Observables)(self._system)
+
     @property
     def kernel_system(self) -> Any:
         """The kernel system that the run keeps, for itself alone; None without one."""
@@ -352,7 +373,7 @@ class SimulationResult(RunOutcome):
             stats=self.stats,
             settings=self.settings,
         )
-        run.request = self.request
+        run.request, run.error = self.request, self.error
         return run
 
     @property
@@ -401,7 +422,7 @@ class SimulationResult(RunOutcome):
     def drift(self) -> FloatArray:
         """Closure errors (n, 2): ||g - s|| (m, rad) and ||G v - s'|| (m/s, rad/s), s the motion of
         the drives; all rows, unscaled."""
-        g, c = constraint_errors(self.mechanism, self.t, self.q, self.v)
+        g, c = self.observables.closure_errors(self.t, self.q, self.v)
         return np.column_stack([np.linalg.norm(g, axis=1), np.linalg.norm(c, axis=1)])
 
     @cached_property
@@ -410,7 +431,8 @@ class SimulationResult(RunOutcome):
 
         Constant torques and wrenches have no potential here.
         """
-        return np.array([self._system.energy(np.concatenate(x)) for x in zip(self.q, self.v)])
+        energy: FloatArray = self.observables.energies(self.q, self.v).sum(axis=1)
+        return energy
 
     @cached_property
     def accelerations(self) -> FloatArray:
@@ -426,6 +448,36 @@ class SimulationResult(RunOutcome):
         nv = self.mechanism.model.nv
         rates = [self._system.evaluate(t, x).rate()[nv:].copy() for t, x in zip(self.t, states)]
         return np.array(rates).reshape(len(rates), nv)
+
+    def point(self, point: Anchor | str) -> PointMotion:
+        """Motion of a point of a link at ``t``: position, velocity and acceleration (n, 3), world
+        axes.
+
+        Parameters
+        ----------
+        point
+            For example ``srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))``, or the name of a point that the
+            mechanism has.
+
+        Raises
+        ------
+        InputError
+            If there is no such point, link or frame; when the acceleration is read, for a loaded
+            run that had a controller.
+        """
+        return self.motion_of(place_of(self.mechanism, point))
+
+    def motion_of(self, place: Place) -> PointMotion:
+        """As :meth:`point`, for a joint and a placement in it."""
+        model = self.mechanism.model
+        readers: dict[str, Callable[[], FloatArray]] = {
+            "position": lambda: point_positions(model, place, self.q),
+            "velocity": lambda: point_velocities(model, place, self.q, self.v),
+            "acceleration": lambda: point_accelerations(
+                model, place, self.q, self.v, self.accelerations
+            ),
+        }
+        return PointMotion(lambda which: readers[which]())
 
     @cached_property
     def energy_balance(self) -> EnergyBalance:
@@ -450,7 +502,7 @@ class SimulationResult(RunOutcome):
             )
 
     @cached_property
-    def _reactions(self) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    def _reactions(self) -> Reactions:
         self._need_controller("reactions")
         return reactions_at(self._system, self.t, self.q, self.v)
 
@@ -458,34 +510,46 @@ class SimulationResult(RunOutcome):
     def reactions(self) -> Mapping[str, FloatArray]:
         """Per loop (n, 6): force (N) then moment (N m) that a exerts on b, at b's origin, world
         axes.  Where redundancy makes them non-unique: the values of least norm."""
-        return self._reactions[0]
+        return self._reactions.closures
 
     @property
     def reaction_multipliers(self) -> Mapping[str, FloatArray]:
         """Per loop (n, rows): the multipliers lam of M v' = f - G^T lam, rows unscaled."""
-        return self._reactions[1]
+        return self._reactions.multipliers
 
-    @cached_property
+    @property
+    def joint_reactions(self) -> Mapping[str, FloatArray]:
+        """Per joint of the tree (n, 6): force (N) then moment (N m) that the parent link exerts on
+        the child, at the origin of the joint, world axes.
+
+        What acts on the coordinates of a joint is part of it: controller, drive, springs, damping,
+        friction.  A rotor (armature) is no part of the child.  Components of
+        :attr:`indeterminate_joint_reactions` follow from reactions of least norm.
+        """
+        return self._reactions.joints
+
+    @property
     def drive_forces(self) -> Mapping[str, FloatArray]:
         """Per drive (n,): the force (N) or torque (N m) that it exerts on its coordinate, in the
         positive sense, and the opposite one on what carries it: what an actuator has to give.
         Where drives and closures are redundant: the values of least norm."""
-        self._need_controller("drive forces")
-        return drive_forces_at(self._system, self.t, self.q, self.v)
+        return self._reactions.drives
 
     @cached_property
     def drive_rates(self) -> Mapping[str, FloatArray]:
         """Per drive (n,): the prescribed rate s'(t) (rad/s, m/s); times the force its power."""
         curves = self.mechanism.drive_curves
-        return {name: np.array([curve(t)[1] for t in self.t]) for name, curve in curves.items()}
+        rates = {name: np.array([curve(t)[1] for t in self.t]) for name, curve in curves.items()}
+        return KnownKeys(rates)
 
     @property
     def coupling_forces(self) -> Mapping[str, FloatArray]:
         """Per coupling (n, joints): generalised forces on its joints, in their order, N m or N."""
-        out = {}
+        out = KnownKeys[FloatArray]()
         for loop in self.mechanism.loops:
             for row, lam in zip(loop.rows.joint_rows, self.reaction_multipliers[loop.name].T):
-                out[loop.name] = -np.outer(lam, row.coefficients)
+                positions = np.column_stack([self.joint(name)[0] for name in row.joints])
+                out[loop.name] = -lam[:, None] * row.gradient(positions)
         return out
 
     @property
@@ -496,6 +560,15 @@ class SimulationResult(RunOutcome):
         the values of least norm (docs/closures.md); all others are unique.
         """
         return self.mechanism.mobility.indeterminate_rows
+
+    @property
+    def indeterminate_joint_reactions(self) -> tuple[str, ...]:
+        """Components of :attr:`joint_reactions` that equilibrium alone does not determine.
+
+        ``joint.fx`` to ``joint.mz``: force and moment along the axes of the world.  They follow
+        from the values of least norm of the closures; all others are unique.
+        """
+        return self.mechanism.mobility.indeterminate_joints
 
     def __repr__(self) -> str:
         first, last = (self.t[0], self.t[-1]) if len(self.t) else (0.0, 0.0)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.dae import DaeSystem
@@ -24,7 +24,14 @@ from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.scaling import constraint_units
 from srm_mbs.dynamics.system import System
-from srm_mbs.errors import ControllerError, EvaluationError, InputError, SimulationError, safe_repr
+from srm_mbs.errors import (
+    ControllerError,
+    EvaluationError,
+    FunctionError,
+    InputError,
+    SimulationError,
+    safe_repr,
+)
 from srm_mbs.integration import driver
 from srm_mbs.integration.breakpoints import BreakpointHandler, SmoothIntervals, smooth_intervals
 from srm_mbs.integration.control.prescribed_times import placed, suspected
@@ -44,7 +51,8 @@ from srm_mbs.integration.kernel import driver as kernel_driver
 from srm_mbs.integration.kernel.backend import uses_kernel
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
-from srm_mbs.integration.kernel.run import CompiledRun
+from srm_mbs.integration.kernel.marshalling import state_from
+from srm_mbs.integration.kernel.run import CompiledRun, first_stage
 from srm_mbs.integration.kernel.system import Evaluator, shared, workspace
 from srm_mbs.integration.messages import (
     MECHANISM,
@@ -97,6 +105,8 @@ STIFF_START = 1e-10
 """First step, over the length of the run, where the start is faster than any step."""
 SMALLER_STEPS = "See solution.crossings; try a smaller rtol or step."
 """Remedy for a passage that may have changed the branch."""
+KEPT_NORMS = 16
+"""Error norms that a mechanism keeps at most."""
 
 Result = TypeVar("Result", bound=SimulationResult)
 Outcome = TypeVar("Outcome", bound=RunOutcome)
@@ -177,10 +187,25 @@ def run_segment(
     by = "kernel" if problem.on_kernel else "python"
     log_start(mechanism.name, options, problem.norm, by)
     record, counters, kernel_system = integrate_problem(problem)
+    if before is None:
+        raise_at_first_call(record.error, options.t0)
     result = assemble_result(problem, record, counters, kernel_system, result_type)
     result.message += bifurcation_sentences(result)
     log_end(mechanism.name, result)
     return result
+
+
+def raise_at_first_call(error: BaseException | None, t0: float) -> None:
+    """Raise the ``error`` of a run from ``t0`` (s), if a function of the user failed where it was
+    called first: at the start there is no result to keep.
+
+    Raises
+    ------
+    ControllerError, EventError
+        With what the function raised as its cause.
+    """
+    if isinstance(error, FunctionError) and error.t == t0:
+        raise error
 
 
 def unstarted_segment(
@@ -274,10 +299,25 @@ def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArr
     return np.broadcast_to(array, (2 * nv,)).copy()
 
 
+@per_start
+def _usual_norms(mechanism: Mechanism) -> dict[tuple[float, float], ErrorNorm]:
+    """Error norms without an absolute tolerance of the user, by rtol and ``negligible``."""
+    return {}
+
+
 def error_norm(mechanism: Mechanism, options: RunOptions) -> ErrorNorm:
     """The error norm with the tolerances of checked ``options``."""
+    known = _usual_norms(mechanism)
+    key = options.rtol, options.negligible
+    if options.atol is None and key in known:
+        return known[key]
     atol = absolute_tolerance(mechanism, options.atol, options.rtol)
-    return ErrorNorm(atol, options.rtol, options.negligible, _units_of_states(mechanism))
+    norm = ErrorNorm(atol, options.rtol, options.negligible, _units_of_states(mechanism))
+    if options.atol is None:
+        if len(known) >= KEPT_NORMS:
+            known.clear()
+        known[key] = norm
+    return norm
 
 
 def initial_state(
@@ -487,14 +527,14 @@ def _starts_too_fast(record: RunRecord, options: RunOptions) -> bool:
 def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counters]:
     system, options, state, norm = problem.system, problem.options, problem.state, problem.norm
     method, t0 = options.method, options.t0
-    evaluator: Any = system if kernel_system is None else Evaluator(system, kernel_system)
+    evaluator = None if kernel_system is None else Evaluator(system, kernel_system)
     handler = BreakpointHandler(problem.intervals, system, method, norm, evaluator)
     if problem.held is not None:
         handler.sample = sampler(system, problem.held, options.controller, kernel_system)
         handler.sample(t0, state)
-    memory = start(system, method, t0, state, norm, options.t_end, evaluator)
-    memory.stiff = problem.stiff
-    if kernel_system is None:
+    if evaluator is None:
+        memory = start(system, method, t0, state, norm, options.t_end)
+        memory.stiff = problem.stiff
         found = integrate_steps(
             system,
             options,
@@ -511,11 +551,12 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
         return found
     check_embedded(method.scheme, options.step)
     given = options.first_step or problem.last_step or None
+    first = first_stage(evaluator, method, t0, state, norm, options.t_end, problem.stiff)
     try:
-        run = _compiled_run(problem, kernel_system, memory, given, handler)
+        run = _compiled_run(problem, kernel_system, first, given, handler)
     except ArithmeticError:  # the reference raises the error that says why
-        first_step = chosen_first_step(evaluator, norm, options, memory, state)
-        run = _compiled_run(problem, kernel_system, memory, first_step, handler)
+        first_step = chosen_first_step(evaluator, norm, options, state_from(first), state)
+        run = _compiled_run(problem, kernel_system, first, first_step, handler)
     with progress_of(options.progress, system, options.t_end) as tick:
         record = kernel_driver.integrate(
             system,
@@ -533,7 +574,7 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
 def _compiled_run(
     problem: Problem,
     kernel_system: Any,
-    memory: IntegratorState,
+    memory: Any,
     first_step: float | None,
     handler: BreakpointHandler,
 ) -> CompiledRun:
@@ -621,6 +662,7 @@ def failed_start(t0: float, state: FloatArray, error: Exception, unit: str = "")
     """The record of a run that could not make its first step."""
     record = RunRecord(t0, state.copy())
     record.status = RunStatus.FAILED
+    record.error = error
     record.message = f"Stopped at t = {t0:.6g}{unit}: {error}."
     return record
 
@@ -714,7 +756,7 @@ def assemble_result(
             )
     controlled = options.controller is not None or system.has_user_forces
     by = "kernel" if problem.on_kernel else "python"
-    return result_type(
+    result = result_type(
         mechanism,
         system,
         scheme,
@@ -737,6 +779,8 @@ def assemble_result(
         stats=stats,
         settings=settings(options, problem.norm, controlled, by, stiff),
     )
+    result.error = record.error
+    return result
 
 
 def _half_turns(names: tuple[str, ...]) -> str:
@@ -765,10 +809,10 @@ def bifurcation_sentences(result: SimulationResult) -> str:
 
 
 @per_model
-def _limited_joints(mechanism: Mechanism) -> tuple[list[str], IndexArray, FloatArray]:
-    """Names, indices in q (k,) and limits (2, k) of the one-degree joints that have limits."""
+def _limited_joints(mechanism: Mechanism) -> list[tuple[str, int, float, float]]:
+    """Name, index in q, least and largest coordinate of the one-degree joints with limits."""
     model = mechanism.model
-    names, indices, limits = [], [], []
+    limited = []
     sprung = {force.joint for force in mechanism.forces if isinstance(force, LimitSpring)}
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
@@ -776,23 +820,21 @@ def _limited_joints(mechanism: Mechanism) -> tuple[list[str], IndexArray, FloatA
             low = float(model.lowerPositionLimit[joint.idx_q])
             high = float(model.upperPositionLimit[joint.idx_q])
             if low < high and (np.isfinite(low) or np.isfinite(high)):
-                names.append(name)
-                indices.append(joint.idx_q)
-                limits.append((low, high))
-    return names, np.array(indices, dtype=int), np.array(limits).reshape(-1, 2).T
+                limited.append((name, joint.idx_q, low, high))
+    return limited
 
 
 def _limits_left(mechanism: Mechanism, least: FloatArray, largest: FloatArray) -> str:
     """A sentence naming the one-degree joints that left their limits, which do not act; ``least``
     and ``largest`` (nq,) are their coordinates."""
-    names, indices, (low, high) = _limited_joints(mechanism)
-    if not names:
+    limited = _limited_joints(mechanism)
+    if not limited:
         return ""
-    least, largest = least[indices], largest[indices]
-    beyond = np.maximum(low - least, largest - high)
-    if not max(beyond.tolist()) > 0.0:
-        return ""
-    # A run that a terminal event ends at a limit has not left it.
-    slack = LIMIT_ROUNDING * np.maximum(1.0, np.maximum(-least, largest))
-    left = [names[k] for k in np.flatnonzero(beyond > slack)]
+    lows, highs = least.tolist(), largest.tolist()
+    left = []
+    for name, i, low, high in limited:
+        # A run that a terminal event ends at a limit has not left it.
+        slack = LIMIT_ROUNDING * max(1.0, -lows[i], highs[i])
+        if max(low - lows[i], highs[i] - high) > slack:
+            left.append(name)
     return f" Joint limits do not act; these joints left theirs: {', '.join(left)}." if left else ""

@@ -125,6 +125,7 @@ class MechanismEntry(StrictData):
     friction_speed: Positive
     defaults: DefaultsEntry
     notes: Sentences
+    points: Annotated[dict[Name, dict[str, Any]], Field(max_length=MOST_ELEMENTS)] = Field({})
 
 
 class StructureEntry(StrictData):

@@ -12,6 +12,8 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.controllers import HeldForce
+from srm_mbs.dynamics.point_motion import Place, PointMotion
+from srm_mbs.errors import KnownKeys
 from srm_mbs.integration.dense_output import StepData, check_within, checked_output_times
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.singular_passages import Bifurcation, Crossing
@@ -109,7 +111,7 @@ class SegmentedResult(SimulationResult):
             status=self.status,
             message=self.message,
         )
-        run.request = self.request
+        run.request, run.error = self.request, self.error
         return run
 
     @property
@@ -140,6 +142,11 @@ class SegmentedResult(SimulationResult):
                 positions[k] = positions[k] + shift
         rates = [rate for _, rate in pairs]
         return self._ordered(positions), self._ordered(rates)
+
+    def motion_of(self, place: Place) -> PointMotion:
+        """See :meth:`~srm_mbs.Solution.motion_of`."""
+        motions = [part.motion_of(place) for part in self._parts]
+        return PointMotion(lambda which: self._ordered([getattr(m, which) for m in motions]))
 
     @cached_property
     def crossings(self) -> tuple[Crossing, ...]:
@@ -175,15 +182,17 @@ class SegmentedResult(SimulationResult):
         """A table of rows by name; 0 in the segments whose mechanism has not that name."""
         tables = [getattr(part, which) for part in self._parts]
         shapes = {name: rows.shape[1:] for table in tables for name, rows in table.items()}
-        return {
-            name: self._ordered(
-                [
-                    table.get(name, np.zeros((len(part.t), *shape)))
-                    for table, part in zip(tables, self._parts)
-                ]
-            )
-            for name, shape in shapes.items()
-        }
+        return KnownKeys(
+            {
+                name: self._ordered(
+                    [
+                        table.get(name, np.zeros((len(part.t), *shape)))
+                        for table, part in zip(tables, self._parts)
+                    ]
+                )
+                for name, shape in shapes.items()
+            }
+        )
 
     @cached_property
     def reactions(self) -> Mapping[str, FloatArray]:
@@ -194,6 +203,11 @@ class SegmentedResult(SimulationResult):
     def reaction_multipliers(self) -> Mapping[str, FloatArray]:
         """See :attr:`~srm_mbs.Solution.reaction_multipliers`; 0 while a closure is not there."""
         return self._named("reaction_multipliers")
+
+    @cached_property
+    def joint_reactions(self) -> Mapping[str, FloatArray]:
+        """See :attr:`~srm_mbs.Solution.joint_reactions`."""
+        return self._named("joint_reactions")
 
     @cached_property
     def drive_forces(self) -> Mapping[str, FloatArray]:
@@ -215,6 +229,12 @@ class SegmentedResult(SimulationResult):
         """See :attr:`~srm_mbs.Solution.indeterminate_reactions`; those of any segment."""
         rows = (row for segment in self.segments for row in segment.indeterminate_reactions)
         return tuple(dict.fromkeys(rows))
+
+    @property
+    def indeterminate_joint_reactions(self) -> tuple[str, ...]:
+        """See :attr:`~srm_mbs.Solution.indeterminate_joint_reactions`; those of any segment."""
+        found = (name for part in self.segments for name in part.indeterminate_joint_reactions)
+        return tuple(dict.fromkeys(found))
 
 
 _ROWS = ("rates", "sigmas", "ranks", "error_ratios", "placements", "held", "stiff")

@@ -42,6 +42,7 @@ from srm_mbs.simulation.runner import (
     checked_options,
     finished,
     initial_state,
+    raise_at_first_call,
     run_segment,
     unstarted_segment,
 )
@@ -359,6 +360,8 @@ def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
         For invalid input, before any stepping.
     SimulationError
         Only with ``raise_on_failure``.
+    ControllerError, EventError
+        If a function of the user fails where it is called first.
     """
     if isinstance(options.events, Iterator):  # they are looked at more than once
         options = options._replace(events=list(options.events))
@@ -390,12 +393,14 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
     t = options.t0
     span = t_end - t
     status, message = RunStatus.RUNNING, ""
+    failure: Exception | None = None
     at_once: list[Occurrence] = []
     try:
         mechanism, q, v = _at_start(events, mechanism, here, span, at_once)
         if at_once:
             here = here._replace(q0=q, v0=v)
     except EventError as error:
+        raise_at_first_call(error, options.t0)
         parts.append(unstarted_segment(mechanism, here, error, types.plain))
         status, message = parts[0].status, parts[0].message
     while status is RunStatus.RUNNING:
@@ -420,10 +425,12 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
         except InputError as error:
             if not parts:
                 raise
-            status = RunStatus.FAILED
+            status, failure = RunStatus.FAILED, error
             message = f"Stopped at t = {t:.9g} s: after the action {error}."
         except EventError as error:
-            status = RunStatus.FAILED
+            if not parts:
+                raise
+            status, failure = RunStatus.FAILED, error
             message = f"Stopped at t = {t:.9g} s: {error}. Everything up to there is kept."
         except KeyboardInterrupt:
             if not parts:
@@ -439,7 +446,9 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
                 at_once.clear()
     if len(parts) > 1:
         message += f" Event actions divide the run into {len(parts)} segments."
-    return types.segmented(parts, t_eval=options.t_eval, status=status, message=message)
+    result = types.segmented(parts, t_eval=options.t_eval, status=status, message=message)
+    result.error = parts[-1].error if failure is None else failure
+    return result
 
 
 def _at_start(

@@ -35,7 +35,7 @@ def terms(mechanism: srm.Mechanism, q: np.ndarray, v: np.ndarray):
     M = np.triu(M) + np.triu(M, 1).T
     nle = np.array(pin.nonLinearEffects(model, data, q, v))
     rows = LoopKinematics(model, mechanism.loops, keep=mechanism.structure.kept)
-    rows.update(data, q)
+    rows.update(data, q, v)
     return M, nle, rows.G.copy()
 
 

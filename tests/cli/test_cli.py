@@ -182,17 +182,28 @@ def test_info_lists_what_is_stiff_with_coefficients_and_times() -> None:
     assert "time constant" not in run("info", "four_bar")
 
 
-def test_massless_ends_are_treated_as_an_option_says(tmp_path: Path) -> None:
-    hinge = '<joint name="{0}" type="continuous"><parent link="{1}"/><child link="{0}"/></joint>'
-    arm = (
-        '<link name="arm"><inertial><mass value="1"/>'
+def flagged_arm(folder: Path) -> Path:
+    """Two arms that turn together, the first with a flag that has no inertia on its axis."""
+    hinge = '<joint name="{0}" type="continuous"><parent link="{1}"/><child link="{0}"/>{2}</joint>'
+    arms = "".join(
+        f'<link name="{name}"><inertial><mass value="1"/>'
         '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        for name in ("arm", "other")
     )
-    path = tmp_path / "arm.urdf"
+    joints = (
+        hinge.format("arm", "base", ""),
+        hinge.format("other", "base", '<mimic joint="arm"/>'),
+        hinge.format("flag", "arm", ""),
+    )
+    path = folder / "arm.urdf"
     path.write_text(
-        f'<robot name="r"><link name="base"/>{arm}<link name="flag"/>'
-        f"{hinge.format('arm', 'base')}{hinge.format('flag', 'arm')}</robot>"
+        f'<robot name="r"><link name="base"/>{arms}<link name="flag"/>{"".join(joints)}</robot>'
     )
+    return path
+
+
+def test_massless_ends_are_treated_as_an_option_says(tmp_path: Path) -> None:
+    path = flagged_arm(tmp_path)
     assert "--massless" in run("info", path, status=2)
     assert "are locked (massless" in run("info", path, "--massless", "fix")
     assert "have 0.1 kg" in run("info", path, "--massless", "0.1,1e-4")
@@ -203,6 +214,43 @@ def test_massless_ends_are_treated_as_an_option_says(tmp_path: Path) -> None:
     run("convert", path, out, "--massless", "fix", "--closing-tolerance", "1e-8")
     assert tomllib.loads(out.read_text())["closing_tolerance"] == 1e-8
     assert "are locked (massless" in run("simulate", out, "--t-end", "0.01") + run("info", out)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("simulate", "--t-end", "0.01"),
+        ("info",),
+        ("modes", "--hold", "arm", "--starts", "2"),
+        ("equilibrium",),
+        ("linearise",),
+        ("drag", "arm=0.1"),
+        ("convert", "out.toml", "--force"),
+    ],
+    ids=lambda command: command[0],
+)
+def test_every_command_that_reads_a_model_file_takes_the_same_options(
+    command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    name, *others = command
+    path = flagged_arm(tmp_path)
+    given = ("--massless", "fix", "--closing-tolerance", "1e-9", "--allow-outside")
+    assert "--massless" in run(name, path, *others, status=2)
+    run(name, path, *others, *given)
+    keyed = tmp_path / "keyed.xml"
+    keyed.write_text(
+        '<mujoco><worldbody><body name="b"><joint name="arm"/><geom size="0.1" pos="1 0 0"/></body>'
+        '<body name="c"><joint name="other"/><geom size="0.1" pos="1 0 0"/></body></worldbody>'
+        '<equality><joint joint1="other" joint2="arm"/></equality>'
+        '<keyframe><key name="home" qpos="0.7 0.7"/></keyframe></mujoco>'
+    )
+    assert "there is no keyframe 'away'" in run(
+        name, keyed, *others, "--keyframe", "away", status=2
+    )
+    run(name, keyed, *others, "--keyframe", "home")
+    if name == "convert":
+        assert tomllib.loads(Path("out.toml").read_text())["initial"]["guess"]["arm"] == 0.7
 
 
 def test_info_of_an_open_chain_has_no_table_of_loops() -> None:

@@ -485,6 +485,7 @@ URDF_FAULTS = {
     "nan rpy": ('rpy="0 0 0"/>\n    <axis', 'rpy="0 0 nan"/>\n    <axis'),
     "zero axis": ("0 -1 0", "0 0 0"),
     "nan axis": ("0 -1 0", "0 nan 0"),
+    "turned axis": ('xyz="0 -1 0"', 'xyz="0 -1 0" rpy="0 0 1"'),
     "nan limit": ('lower="-10"', 'lower="nan"'),
     "negative effort": ('effort="1"', 'effort="-1"'),
     "negative velocity": ('velocity="1"', 'velocity="-2"'),

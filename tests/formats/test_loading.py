@@ -521,7 +521,8 @@ CRANKS = {
     "slider_crank_slider": [("crank", 2.0, 0.0)],
     "slider_crank_whirl": [("crank", 2.0, 0.0)],
 }
-OTHERS = {"spatial_four_bar", "spatial_dead_point", "squeezing_mechanism", *made()}
+TYPED_IN = {"klann_walker", "quick_return", "scissor_lift", "toggle_press", "wiper"}
+OTHERS = {"spatial_four_bar", "spatial_dead_point", "squeezing_mechanism", *made(), *TYPED_IN}
 """Tested elsewhere."""
 
 
@@ -529,7 +530,7 @@ def test_the_conventions_of_all_planar_bundled_mechanisms_are_tested() -> None:
     assert set(CRANKS) == set(NAMES) - OTHERS
 
 
-@pytest.mark.parametrize("name", CRANKS)
+@pytest.mark.parametrize("name", [*CRANKS, *sorted(TYPED_IN)])
 def test_bundled_planar_mechanisms_lie_in_the_x_z_plane(name: str) -> None:
     mechanism = load(name)
     data = mechanism.model.createData()
@@ -915,6 +916,22 @@ def test_other_treatments_of_massless_ends_are_refused(given: Any, tmp_path: Pat
     with pytest.raises(srm.InputError, match=r'Write "fix", or \{ mass') as caught:
         srm.load(write(tmp_path, with_flag()), massless=given)
     assert caught.value.element == "massless"
+
+
+def test_a_file_without_inertia_is_told_what_moves_it(tmp_path: Path) -> None:
+    """As most URDFs of industry are, whose joints would all be locked."""
+    text = re.sub(r"<inertial>.*?</inertial>", "", zoo_urdf(), flags=re.DOTALL)
+    with pytest.raises(srm.InputError, match=r"nothing in this mechanism can move") as caught:
+        srm.load(write(tmp_path, text), massless="fix")
+    assert 'massless={"mass"' in caught.value.remedy
+    given = {"mass": 1.0, "inertia": 0.1}
+    assert srm.load(write(tmp_path, text), massless=given).model.nv == zoo_model().nv
+
+
+def test_an_axis_that_is_turned_by_zero_is_an_axis(tmp_path: Path) -> None:
+    turned = zoo_urdf().replace("<axis ", '<axis rpy="0 0 0" ')
+    models = [srm.load(write(tmp_path, text)).model for text in (zoo_urdf(), turned)]
+    assert models[0] == models[1]
 
 
 def test_a_massless_link_inside_a_chain_is_no_fault(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.formats import xml
-from srm_mbs.formats.xml import DASHES, parse_xml
+from srm_mbs.formats.xml import DASHES, LATE_DECLARATION, parse_xml
 from tests.support import sdf_files
 from tests.support.urdf_files import tree
 
@@ -81,3 +81,18 @@ def test_every_format_notes_it_once(tmp_path: Path) -> None:
         plain = path.with_stem("plain")
         plain.write_text(text.replace("<!-- -- -->", ""))
         assert srm.load(path).notes == (DASHES, *srm.load(plain).notes)
+
+
+@pytest.mark.parametrize("before", ["\n\n", "<!-- a robot -->\n", "<!-- a -- b -->"])
+def test_a_declaration_after_blank_lines_or_comments_is_skipped(before: str) -> None:
+    notes: list[str] = []
+    root = parse_xml(f'{before}<?xml version="1.0" ?>\n<a><b/></a>', "x.urdf", notes)
+    assert [node.tag for node in root] == ["b"]
+    assert LATE_DECLARATION in notes
+    assert (DASHES in notes) == ("--" in before[4:-4])
+
+
+def test_a_second_declaration_is_refused() -> None:
+    text = '<?xml version="1.0"?><a><?xml version="1.0"?></a>'
+    with pytest.raises(srm.InputError, match="not well-formed"):
+        parse_xml(text, "x.urdf")

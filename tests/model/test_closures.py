@@ -21,8 +21,9 @@ from scipy.spatial.transform import Rotation
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.constraints.rows import LoopKinematics, row_wrenches
+from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.dynamics.constraints.structure import Structure
+from srm_mbs.dynamics.constraints.wrenches import Placements, row_wrenches
 from srm_mbs.dynamics.multibody import ClosedSystem
 from srm_mbs.dynamics.scaling import Units
 from srm_mbs.errors import EvaluationError
@@ -336,7 +337,7 @@ def test_update_without_bias_leaves_the_rows_the_same() -> None:
     rows = LoopKinematics(here.model, here.loops)
     data = here.model.createData()
     pin.crba(here.model, data, here.q, pin.Convention.WORLD)
-    rows.update(data, here.q, with_bias=False)
+    rows.update(data, here.q)
     np.testing.assert_array_equal(rows.g, g)
     np.testing.assert_array_equal(rows.G, G)
 
@@ -448,7 +449,9 @@ def test_wrenches_of_the_rows_do_the_work_that_the_multipliers_do(kind: str, pla
     here = scene(0, (kind, place))
     data = here.model.createData()
     pin.forwardKinematics(here.model, data, here.q, here.v)
-    wrenches = row_wrenches(here.loop, here.model, data)
+    placed = Placements.empty(here.model, 1)
+    placed.take(0, data)
+    wrenches = row_wrenches(here.loop, here.model, placed)[0]
     at_b = anchor_placement(here.model, here.q, here.loop.b)[1]
     powers = []
     for joint, _ in here.loop.resolve(here.model):
@@ -522,7 +525,8 @@ def test_every_type_says_what_it_needs_and_takes() -> None:
         "coupling": ("joints",),
     }
     assert {name: kind.needs for name, kind in CLOSURE_TYPES.items()} == needs
-    takes = {"distance": ("length",), "coupling": ("ratio", "coefficients", "offset")}
+    coupling = ("ratio", "coefficients", "offset", "polynomial", "arguments")
+    takes = {"distance": ("length",), "coupling": coupling}
     for name, kind in CLOSURE_TYPES.items():
         assert kind.takes == takes.get(name, ())
         assert kind.name == name

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs.analysis.summary import loop_rows
@@ -243,6 +244,16 @@ WRONG = {
     "locked": f"{BOTH}ratio = 1.0",
     "anchors": f'{BOTH}ratio = 1.0\na = {{ link = "a" }}',
     "not finite": f"{BOTH}ratio = nan",
+    "constant polynomial": f"{BOTH}polynomial = [0.3]",
+    "polynomial and ratio": f"{BOTH}polynomial = [0.3, 1.0, 2.0]\nratio = 2.0",
+    "polynomial and offset": f"{BOTH}polynomial = [0.3, 1.0, 2.0]\noffset = 2.0",
+    "polynomial of one joint": 'joints = ["a_joint"]\npolynomial = [0.3, 1.0, 2.0]',
+    "polynomial of no numbers": f"{BOTH}polynomial = [0.3, inf]",
+    "arguments alone": f"{BOTH}arguments = [0.3, 1.0]",
+    "arguments without coefficients": f"{BOTH}polynomial = [0.0, 1.0, 1.0]\narguments = [0.0, 1.0]",
+    "a joint on neither side": (
+        f"{BOTH}polynomial = [0.0, 1.0, 1.0]\ncoefficients = [1.0, 0.0]\narguments = [1.0, 0.0]"
+    ),
     "held positions that contradict it": (
         f"{BOTH}ratio = 2.0\n[initial]\nq = {{ a_joint = 1.0, b_joint = 1.0 }}"
     ),
@@ -324,6 +335,14 @@ def test_the_kernel_evaluates_couplings_like_the_reference(algebra: str) -> None
         srm.LoopClosure("coupling", joints=names, coefficients=(1.0, 0.4, -2.0), name="three"),
         srm.LoopClosure("distance", first, last, length=0.8, name="rod"),
         srm.LoopClosure("coupling", joints=names[:2], ratio=3.0, offset=0.1, name="two"),
+        srm.LoopClosure(
+            "coupling",
+            joints=names,
+            polynomial=(0.1, 0.4, -0.3, 0.2),
+            coefficients=(1.0, 0.0, 0.5),
+            arguments=(0.3, 1.0, 0.0),
+            name="cam",
+        ),
     )
     mechanism = srm.Mechanism(model, loops)
     system = ClosedSystem(mechanism)
@@ -358,3 +377,168 @@ def test_a_rod_between_wheels_takes_its_length_from_the_guess_and_keeps_it(tmp_p
     assert srm.load_solution(tmp_path / "run.npz").mechanism.loops == (rod,)
     with pytest.raises(srm.InputError, match=r"wheels\.toml: loop 'rod': a distance of 0 has no"):
         load(tmp_path, GEARS, text.replace('name = "rod"', 'name = "rod"\nlength = 0.0'))
+
+
+CAM = (
+    '[[loop]]\nname = "cam"\ntype = "coupling"\njoints = ["slider_joint", "cam_joint"]\n'
+    "polynomial = [0.1, 0.05, 0.2, -0.03]\n"
+    "[initial]\nq = { cam_joint = -0.7 }\nv = { cam_joint = 2.0 }\n"
+)
+CAM_WHEELS = wheel("slider", 0.1, "prismatic", mass=1.3) + wheel("cam", 0.3, axis="0 1 0")
+
+
+def along_a_cam(phi: float, rate: float, times: np.ndarray) -> np.ndarray:
+    """(phi, phi') at ``times`` of a wheel I that lifts a mass m by x = p(phi), reduced to phi:
+    (I + m p'^2) phi'' = -m p' (p'' phi'^2 + g), integrated by SciPy."""
+    p = np.polynomial.Polynomial([0.1, 0.05, 0.2, -0.03])
+    slope, curvature = p.deriv(), p.deriv(2)
+    mass, inertia = 1.3, 0.3
+
+    def field(_: float, y: np.ndarray) -> list[float]:
+        phi, rate = y
+        force = -mass * slope(phi) * (curvature(phi) * rate**2 + 9.81)
+        return [rate, force / (inertia + mass * slope(phi) ** 2)]
+
+    span = (times[0], times[-1])
+    return solve_ivp(field, span, [phi, rate], "DOP853", times, rtol=1e-12, atol=1e-12).y
+
+
+@on_both
+def test_a_cam_lifts_a_mass_as_the_reduced_equation_has_it(backend: str, tmp_path: Path) -> None:
+    """The force on the slider is m (x'' + g), and on the cam -p' times that."""
+    mechanism = load(tmp_path, CAM_WHEELS, CAM)
+    assert mechanism.degrees_of_freedom == 1
+    assert mechanism.redundant_rows == ()
+    assert row_dimensions(mechanism) == ("m",)
+    times = np.linspace(0.0, 2.0, 41)
+    run = srm.simulate(mechanism, 2.0, rtol=1e-10, backend=backend, t_eval=times)
+    expected, rates = along_a_cam(-0.7, 2.0, times)
+    x, x_rate = run.joint("slider_joint")
+    phi, phi_rate = run.joint("cam_joint")
+    assert_close(phi, expected, atol=1e-8)
+    assert_close(phi_rate, rates, atol=1e-7)
+    p = np.polynomial.Polynomial([0.1, 0.05, 0.2, -0.03])
+    assert_close(x, p(phi), atol=1e-12)
+    assert_close(x_rate, p.deriv()(phi) * phi_rate, atol=1e-11)
+    assert np.abs(run.energy - run.energy[0]).max() < 1e-8
+    forces = run.coupling_forces["cam"]
+    assert_close(forces[:, 1], -p.deriv()(phi) * forces[:, 0], atol=1e-9)
+    # Power of gravity and of the coupling is the rate of the slider's kinetic energy.
+    gained = 0.5 * 1.3 * x_rate**2
+    work = np.gradient(gained, times, edge_order=2)[5:-5]
+    assert_close(((forces[:, 0] - 1.3 * 9.81) * x_rate)[5:-5], work, atol=0.3)
+
+
+POLYNOMIALS = {
+    "two": {"polynomial": (0.3, -0.4, 0.0, 0.25, -0.1)},
+    "three": {"polynomial": (0.1, 0.5, -0.3), "coefficients": (1.0, 0.6, 0.0),
+              "arguments": (0.0, 0.2, -1.5)},
+    "linear": {"polynomial": (0.2, 1.5)},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", POLYNOMIALS)
+def test_rows_of_polynomials_are_the_derivatives_of_their_values(name: str) -> None:
+    """G by central differences, Gdot v by those of G v along the motion q + h v."""
+    model, names = joints_of_many_kinds(1)
+    keys = POLYNOMIALS[name]
+    joints = names[: len(keys.get("arguments", (0, 0)))]
+    loop = srm.LoopClosure("coupling", joints=joints, name=name, **keys)
+    rows = LoopKinematics(model, [loop], np.array([0.4]))
+    rng = np.random.default_rng(5)
+    left = np.array(keys.get("coefficients", (1.0, 0.0)))
+    right = np.array(keys.get("arguments", (0.0, 1.0)))
+    for _ in range(4):
+        q, v = random_state(model, rng)
+        g, G, bias = evaluate_rows(model, rows, q, v)
+        x = np.array([q[model.joints[model.getJointId(joint)].idx_q] for joint in joints])
+        value = left @ x - np.polynomial.Polynomial(keys["polynomial"])(right @ x)
+        assert_close(g, [value / 0.4], atol=1e-13)
+        step = 1e-4
+        for column, e in enumerate(np.eye(model.nv)):
+            near = [pin.integrate(model, q, h * e) for h in (step, -step)]
+            (forward, *_), (back, *_) = (evaluate_rows(model, rows, at, v) for at in near)
+            assert_close(G[:, column], (forward - back) / (2.0 * step), atol=1e-6)
+        near = [pin.integrate(model, q, h * v) for h in (step, -step)]
+        forward, back = (evaluate_rows(model, rows, at, v)[1] @ v for at in near)
+        assert_close(bias, (forward - back) / (2.0 * step), atol=1e-5)
+        assert rows.pattern()[:, np.flatnonzero(G[0])].all()
+        (row,) = loop.rows.joint_rows
+        own = [model.joints[model.getJointId(joint)].idx_v for joint in joints]
+        assert_close(row.gradient(x[None])[0], 0.4 * G[0, own], atol=1e-13)
+    assert rows.is_constant == (name == "linear")
+
+
+@on_both
+def test_the_same_cam_twice_is_redundant_and_a_locked_one_has_no_row(
+    backend: str, tmp_path: Path
+) -> None:
+    """Two equal relations, one times 2, share their force; the motion is that of one."""
+    general = (
+        '[[loop]]\nname = "twin"\ntype = "coupling"\njoints = ["cam_joint", "slider_joint"]\n'
+        "coefficients = [0.0, 2.0]\narguments = [1.0, 0.0]\npolynomial = [0.2, 0.1, 0.4, -0.06]\n"
+    )
+    mechanism = load(tmp_path, CAM_WHEELS, general + CAM)
+    assert mechanism.degrees_of_freedom == 1
+    assert mechanism.mobility.pivoted_redundancy == 1
+    run = srm.simulate(mechanism, 1.0, rtol=1e-9, backend=backend)
+    assert_close(run.joint("cam_joint")[0], along_a_cam(-0.7, 2.0, run.t)[0], atol=1e-7)
+    assert run.indeterminate_reactions == ("twin.coupling", "cam.coupling")
+
+
+def test_a_description_with_a_polynomial_is_converted_saved_and_shown(tmp_path: Path) -> None:
+    mechanism = load(tmp_path, CAM_WHEELS, CAM)
+    (row,) = loop_rows(mechanism)
+    assert row[3] == "slider_joint = +0.1 +0.05 y +0.2 y^2 -0.03 y^3, y = cam_joint"
+    srm.convert(tmp_path / "wheels.toml", tmp_path / "again.toml")
+    assert srm.load(tmp_path / "again.toml").loops == mechanism.loops
+    run = srm.simulate(mechanism, 0.5)
+    run.save(tmp_path / "run.npz")
+    again = srm.load_solution(tmp_path / "run.npz")
+    assert again.mechanism.loops == mechanism.loops
+    assert_close(again.coupling_forces["cam"], run.coupling_forces["cam"], atol=1e-12)
+
+
+@on_both
+def test_a_stiff_spring_on_a_cam_runs_as_the_reduced_equation_has_it(
+    backend: str, tmp_path: Path
+) -> None:
+    """Implicit steps have no closed form of its derivatives, and need none."""
+    damper = (
+        '[[force]]\ntype = "torsion_spring"\njoint = "cam_joint"\ndamping = 3000.0\n'
+        "stiffness = 10.0\n"
+    )
+    mechanism = load(tmp_path, CAM_WHEELS, damper + CAM)
+    p = np.polynomial.Polynomial([0.1, 0.05, 0.2, -0.03])
+
+    def field(_: float, y: np.ndarray) -> list[float]:
+        slope = p.deriv()(y[0])
+        force = -1.3 * slope * (p.deriv(2)(y[0]) * y[1] ** 2 + 9.81)
+        return [y[1], (force - 3000.0 * y[1] - 10.0 * y[0]) / (0.3 + 1.3 * slope**2)]
+
+    times = np.linspace(0.0, 1.0, 11)
+    run = srm.simulate(mechanism, 1.0, rtol=1e-8, backend=backend, t_eval=times)
+    expected = solve_ivp(field, (0.0, 1.0), [-0.7, 2.0], "Radau", times, rtol=1e-10, atol=1e-12)
+    assert_close(run.joint("cam_joint")[0], expected.y[0], atol=1e-6)
+
+
+def test_a_cam_is_linearised_with_the_curvature_of_its_polynomial(tmp_path: Path) -> None:
+    """In motion, against differences of the reduced equation."""
+    spring = (
+        '[[force]]\ntype = "torsion_spring"\njoint = "cam_joint"\nstiffness = 40.0\ndamping = 0.5\n'
+    )
+    mechanism = load(tmp_path, CAM_WHEELS, spring + CAM)
+    p = np.polynomial.Polynomial([0.1, 0.05, 0.2, -0.03])
+    slope, curvature = p.deriv(), p.deriv(2)
+
+    def acceleration(phi: float, rate: float) -> float:
+        force = -1.3 * slope(phi) * (curvature(phi) * rate**2 + 9.81) - 40.0 * phi - 0.5 * rate
+        return float(force / (0.3 + 1.3 * slope(phi) ** 2))
+
+    found = srm.linearise(mechanism, mechanism.q0, mechanism.v0, coordinates="cam_joint")
+    h = 1e-5
+    expected = [
+        (acceleration(-0.7 + h, 2.0) - acceleration(-0.7 - h, 2.0)) / (2.0 * h),
+        (acceleration(-0.7, 2.0 + h) - acceleration(-0.7, 2.0 - h)) / (2.0 * h),
+    ]
+    assert_close(found.A, [[0.0, 1.0], expected], atol=1e-6)

@@ -301,7 +301,10 @@ def test_a_function_that_fails_ends_the_run_with_its_name(backend: str) -> None:
             raise ValueError("no more")
         return np.zeros(1)
 
-    for function, words in ((broken, "no more"), (lambda t, q, v: np.zeros(3), "must return 1")):
+    def grown(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.zeros(3 if t > 0.5 else 1)
+
+    for function, words in ((broken, "no more"), (grown, "must return 1")):
         mechanism = replace(pendulum(), forces=(srm.UserForce(function, name="mine"),))
         run = srm.simulate(mechanism, 1.0, backend=backend)
         assert not run.success

@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
+from srm_mbs.errors import ControllerError
 from tests.support.mechanisms import along_x, floating_ring, rod
 from tests.support.snapshots import check_messages, refused
 
@@ -129,10 +130,13 @@ def test_a_controller_that_raises_ends_the_run_with_what_was_computed(
 
 @pytest.mark.parametrize("bad", [np.full(3, np.nan), np.zeros(2), "text"], ids=str)
 def test_a_controller_that_returns_nonsense_is_named(four_bar: srm.Mechanism, bad: Any) -> None:
-    solution = srm.simulate(four_bar, 1.0, controller=lambda t, q, v: bad)
+    with pytest.raises(ControllerError, match="the controller r"):
+        srm.simulate(four_bar, 1.0, controller=lambda t, q, v: bad)
+    good = np.zeros(3)
+    solution = srm.simulate(four_bar, 1.0, controller=lambda t, q, v: good if t < 0.2 else bad)
     assert solution.status == "failed"
     assert "controller" in solution.message
-    assert len(solution.t) == 1
+    assert isinstance(solution.error, ControllerError)
 
 
 def test_a_mechanism_that_blows_up_returns_what_was_computed() -> None:

@@ -149,7 +149,10 @@ def test_locked_joints_and_moving_bases_are_saved(tmp_path: Path) -> None:
 
 
 def test_a_failed_run_can_be_saved(tmp_path: Path) -> None:
-    solution = srm.simulate(srm.load("four_bar"), 1.0, controller=lambda t, q, v: [np.nan])
+    def only_at_the_start(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.full(3, 0.0 if t == 0.0 else np.nan)
+
+    solution = srm.simulate(srm.load("four_bar"), 1.0, controller=only_at_the_start)
     assert not solution.success
     loaded = reloaded(solution, tmp_path)
     assert loaded.status == "failed"

@@ -32,7 +32,7 @@ def fingerprint(mechanism: srm.Mechanism) -> dict[str, Any]:
         v = rng.standard_normal(model.nv)
         pin.crba(model, data, q, pin.Convention.WORLD)
         pin.nonLinearEffects(model, data, q, v)
-        rows.update(data, q)
+        rows.update(data, q, v)
         force = data.nle + model.damping * v + model.friction * np.tanh(v)
         force -= forces.generalised(data, q, v, 0.0)
         tree += [np.triu(data.M).ravel().tolist(), force.tolist()]

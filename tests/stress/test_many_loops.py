@@ -66,7 +66,7 @@ def test_loading_many_loops_factorises_nothing_that_is_large_and_dense(
         original = getattr(module, name)
 
         def watched(a: np.ndarray, *rest: Any, **options: Any) -> Any:
-            assert min(np.shape(a)) <= row_algebra.ARPACK_ABOVE, f"{name} of {np.shape(a)}"
+            assert min(np.shape(a)) <= row_algebra.SPARSE_ABOVE, f"{name} of {np.shape(a)}"
             return original(a, *rest, **options)
 
         monkeypatch.setattr(module, name, watched)
@@ -76,7 +76,7 @@ def test_loading_many_loops_factorises_nothing_that_is_large_and_dense(
     for name in ("dgeqp3", "dgesdd"):
         watch(lapack, name)
     assert srm.n_four_bar(160).degrees_of_freedom == 1
-    monkeypatch.setattr(row_algebra, "ARPACK_ABOVE", 2)
+    monkeypatch.setattr(row_algebra, "SPARSE_ABOVE", 2)
     with pytest.raises(AssertionError, match="of "):
         srm.n_four_bar(2)
 

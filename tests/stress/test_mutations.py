@@ -30,8 +30,9 @@ def bundled_files() -> dict[str, Files]:
     out = {}
     for name in srm.bundled_models():
         toml = (models_folder() / f"{name}.toml").read_text()
-        urdf = models_folder() / tomllib.loads(toml)["urdf"]
-        out[name] = Files(toml, urdf.read_text())
+        urdf = tomllib.loads(toml).get("urdf")
+        if urdf is not None:  # linkages typed in have none
+            out[name] = Files(toml, (models_folder() / urdf).read_text())
     return out
 
 

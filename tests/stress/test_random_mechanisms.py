@@ -34,7 +34,7 @@ def rank_at_start(mechanism: srm.Mechanism) -> int:
     data = model.createData()
     rows = LoopKinematics(model, mechanism.loops)
     pin.crba(model, data, mechanism.q0, pin.Convention.WORLD)
-    rows.update(data, mechanism.q0, with_bias=False)
+    rows.update(data, mechanism.q0)
     units = mechanism.structure.units
     G = rows.G / row_units(mechanism, units)[:, None] * units.coordinate
     return int(np.linalg.matrix_rank(G, tol=1e-9))

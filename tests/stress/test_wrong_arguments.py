@@ -96,7 +96,15 @@ def test_every_public_function_is_called(tmp_path: Path) -> None:
     results = {  # made by the package only
         *("Assembly", "AssemblyMode", "ButcherTableau", "Certificate", "DaeSolution"),
         *("EnergyBalance", "Equilibrium", "FollowedPath", "ForceElement", "InverseDynamics"),
-        *("Linearisation", "MobilityMap", "Solution", "Sweep", "LiveView"),
+        *(
+            "Linearisation",
+            "Linkage",
+            "LinkageReport",
+            "MobilityMap",
+            "Solution",
+            "Sweep",
+            "LiveView",
+        ),
         *("CLOSURE_TYPES", "FORCE_TYPES", "LAW_TYPES", "TABLEAUS", "SrmWarning"),
         *("AnalysisError", "AssemblyError", "InputError", "SimulationError", "SrmError"),
     }

@@ -136,6 +136,18 @@ def calls(folder: Path) -> dict[str, Call]:
         "load": Call(srm.load, ("four_bar",), {"cut": (), "base": None, "gravity": None}),
         "load_solution": Call(srm.load_solution, (folder / "saved.npz",)),
         "convert": Call(srm.convert, ("four_bar", folder / "c.toml"), {"cut": (), "force": True}),
+        "planar": Call(
+            srm.planar,
+            (),
+            {
+                **{"points": {"O": (0.0, 0.0), "A": (1.0, 0.0)}, "bars": {"bar": ("O", "A")}},
+                **{"ground": ("O",), "mass_per_length": 1.0, "masses": {"bar": 2.0}},
+                **{"inertias": {"bar": 1.0}, "lengths": {"bar": 1.0}, "start": {"O": 0.5}},
+                **{"rates": {"O": 1.0}, "springs": (), "torques": {"O": 1.0}, "unit": "m"},
+                **{"loads": {"A": (0.0, 1.0)}, "drives": None, "sliders": None, "angle": "deg"},
+                **{"gravity": (0.0, -9.81), "name": "x", "cut": ()},
+            },
+        ),
         "bundled_models": Call(srm.bundled_models),
         "n_four_bar": Call(srm.n_four_bar, (2,)),
         "assemble": Call(
@@ -149,6 +161,7 @@ def calls(folder: Path) -> dict[str, Call]:
         "equilibrium": Call(
             srm.equilibrium, (four_bar, {}), {"hold": [crank], "search": "nearest"}
         ),
+        "linkage_report": Call(srm.linkage_report, (four_bar, crank)),
         "linearise": Call(
             srm.linearise,
             (four_bar, q, v),

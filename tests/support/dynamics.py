@@ -51,7 +51,7 @@ def evaluate_rows(
     data = model.createData()
     pin.crba(model, data, q, pin.Convention.WORLD)
     pin.nonLinearEffects(model, data, q, v)
-    rows.update(data, q)
+    rows.update(data, q, v)
     return rows.g.copy(), rows.G.copy(), rows.bias.copy()
 
 

@@ -18,7 +18,7 @@ from srm_mbs.integration.breakpoints import BreakpointHandler, smooth_intervals
 from srm_mbs.integration.control.branch_guard import BranchGuard
 from srm_mbs.integration.control.placement import SingularityPlacement, SlopeOfSigma
 from srm_mbs.integration.control.step_size import FixedStep, PIControl, StepDecision, initial_step
-from srm_mbs.integration.kernel.marshalling import control_struct
+from srm_mbs.integration.kernel.marshalling import control_struct, state_struct
 from srm_mbs.integration.kernel.run import CompiledRun, ReturnReason
 from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.integration.methods.base import NEGLIGIBLE, ErrorNorm
@@ -143,7 +143,7 @@ def compare(
         kernel_system,
         method,
         norm,
-        memory,
+        state_struct(memory),
         x,
         intervals,
         step=step,

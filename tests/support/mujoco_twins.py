@@ -11,6 +11,7 @@ import pytest
 import tomli_w
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.dynamics.forces import ForceKinematics
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.mjcf.reader import translate
@@ -18,6 +19,7 @@ from srm_mbs.formats.toml.description import check_description, parse_toml
 from srm_mbs.formats.translation import Options
 from srm_mbs.formats.urdf.parser import build_urdf
 from srm_mbs.model.anchors import Anchor
+from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.reach import Reach
 
 mujoco = pytest.importorskip("mujoco")
@@ -112,21 +114,20 @@ class Twins:
         joint, inside = Anchor(**entry).resolve(self.model)
         return self.data.oMi[joint] * inside
 
+    def coupling(self, entry: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
+        """g (1,) and G (1, nv) of a coupling of joints."""
+        rows = LoopKinematics(self.model, [LoopClosure(**entry)])
+        rows.update(self.data, self.q)
+        return rows.g, rows.G
+
     def residuals(self) -> list[FloatArray]:
         """What MuJoCo's residuals of the equality constraints should be."""
         out = []
         for loop in self.entries.get("loop", ()):
             if loop["type"] == "coupling":
-                positions = np.array(
-                    [
-                        self.q[self.model.joints[self.model.getJointId(name)].idx_q]
-                        for name in loop["joints"]
-                    ]
-                )
-                factors = np.array(loop.get("coefficients") or [1.0, -loop["ratio"]])
-                residual = factors @ positions - loop["offset"]
+                g, G = self.coupling(loop)
                 # Those of tendons have a factor of their own.
-                out.append(np.abs([residual]) / np.linalg.norm(factors))
+                out.append(np.abs(g) / np.linalg.norm(G))
                 continue
             a, b = self.anchor(loop["a"]), self.anchor(loop["b"])
             out.append(a.translation - b.translation)
@@ -176,20 +177,27 @@ def check_dynamics(twins: Twins, atol: float = 1e-10) -> None:
 
 
 def check_residuals(twins: Twins) -> None:
-    """The residuals of the equality constraints are those of MuJoCo."""
+    """The residuals of the equality constraints, and the rows of couplings but for a factor, are
+    those of MuJoCo."""
     state = twins.state
     for q, v in random_states(twins):
-        twins.put(q, v)
+        T = twins.put(q, v)
         expected = []
         kind = state.efc_type[: state.nefc]
         held = kind == mujoco.mjtConstraint.mjCNSTR_EQUALITY
         rows = state.efc_pos[: state.nefc][held]
-        lengths = np.linalg.norm(state.efc_J.reshape(state.nefc, -1)[held], axis=1)
         at = 0
+        jacobian = state.efc_J.reshape(state.nefc, -1)[held]
+        lengths = np.linalg.norm(jacobian, axis=1)
         for loop in twins.entries["loop"]:
             count = {"point": 3, "frame": 6, "coupling": 1}[loop["type"]]
             own = rows[at : at + count]
             at += count
+            if count == 1:
+                (G,) = twins.coupling(loop)[1]
+                theirs = jacobian[at - 1] @ T / lengths[at - 1]
+                G *= np.sign(theirs @ G) / np.linalg.norm(G)
+                np.testing.assert_allclose(G, theirs, atol=1e-12)
             expected.append(own[:3] if count > 1 else np.abs(own) / lengths[at - 1])
             if count == 6:
                 expected.append(np.array([np.linalg.norm(own[3:])]))

@@ -144,7 +144,7 @@ def index_one(mechanism: Mechanism) -> Field:
         q, v = x[:nv], x[nv:]
         pin.crba(model, data, q, pin.Convention.WORLD)
         pin.nonLinearEffects(model, data, q, v)
-        rows.update(data, q)
+        rows.update(data, q, v)
         kkt = np.block([[data.M, rows.G.T], [rows.G, np.zeros((m, m))]])
         right = np.concatenate([-data.nle - model.damping * v, -rows.bias])
         return np.concatenate([v, np.linalg.solve(kkt, right)[:nv]])

@@ -29,7 +29,7 @@ private:
     double sigma_at(double t, const double* state, const double* direction, double length);
 
     System& system_;
-    const Constants constants_;
+    const Constants& constants_;
     const int nv_, nx_;
     // Of the nodes (count, nv): positions, motions onto the closures, rates off the branch,
     // multipliers.

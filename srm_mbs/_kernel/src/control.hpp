@@ -96,7 +96,7 @@ public:
 private:
     double t_end_, h_;
     int orders_[2], order_;
-    Constants constants_;
+    const Constants& constants_;
     double xi_old_ = 1.0;
     bool just_rejected_ = false;
 };
@@ -218,7 +218,7 @@ private:
     // found, or now.
     enum class Arrival { none = 0, watched = 1, due = 2 };
 
-    Constants constants_;
+    const Constants& constants_;
     double t_end_;
     Arrival first_arrival_, arrival_;
     // The multipliers up to the end are known; those next to the singular configuration are solved
@@ -281,7 +281,7 @@ private:
     bool velocity_jumps(const StepResult& result) const;
 
     const System& system_;
-    Constants constants_;
+    const Constants& constants_;
     double limit_ = std::numeric_limits<double>::infinity();
     int tries_ = 0;
     mutable std::vector<double> work_;

@@ -160,9 +160,13 @@ private:
 
     // Independent rows, by Gram-Schmidt with the largest remainder next.
     void choose_rows() {
+        chosen_.clear();
+        if (all_ == rank_) {
+            for (int i = 0; i < rank_; ++i) chosen_.push_back(i);
+            return;
+        }
         std::vector<double> left(closures_.G);
         std::vector<bool> taken(all_, false);
-        chosen_.clear();
         for (int k = 0; k < rank_; ++k) {
             int next = -1;
             double size = -1.0;
@@ -215,31 +219,35 @@ private:
     }
 
     // The Hessian of u . g, by differences of G^T u: for Newton's steps from here, or central ones.
+    // Coordinates that no rows have in common change together.
     bool differentiate(bool central = false) {
+        const double length = constants_.critical_difference;
+        const ColumnGroups& columns = closures_.system.column_groups();
         hessian_.assign(static_cast<std::size_t>(n_) * n_, 0.0);
-        std::vector<double> here(n_, 0.0), e(n_);
-        for (int i = 0; i < rank_; ++i) add(u_[i], &G_[i * n_], here.data(), n_);
-        for (int j = 0; j < n_; ++j) {
-            std::fill(e.begin(), e.end(), 0.0);
-            const double length = constants_.critical_difference;
-            for (const double sign : {1.0, -1.0}) {
-                e[j] = sign * length;
-                if (sign < 0.0 && !central) break;
-                std::vector<double> x(x_);
-                double time = time_;
-                closures_.move(e.data(), x, time);
-                closures_.evaluate(x, time);
-                for (int i = 0; i < rank_; ++i) {
-                    const double* row = &closures_.G[chosen_[i] * n_];
-                    for (int k = 0; k < n_; ++k) hessian_[k * n_ + j] += sign * u_[i] * row[k];
-                }
-            }
-            for (int k = 0; k < n_; ++k) {
-                double& value = hessian_[k * n_ + j];
-                value = central ? value / (2.0 * length) : (value - here[k]) / length;
-            }
+        std::vector<double> ahead(n_), behind(n_, 0.0);
+        if (!central)
+            for (int i = 0; i < rank_; ++i) add(u_[i], &G_[i * n_], behind.data(), n_);
+        const double apart = central ? 2.0 * length : length;
+        for (const std::vector<int>& group : columns.groups) {
+            gradient(group, length, ahead);
+            if (central) gradient(group, -length, behind);
+            for (const int j : group)
+                for (const int k : columns.neighbours[j])
+                    hessian_[k * n_ + j] = (ahead[k] - behind[k]) / apart;
         }
         return finite(hessian_.data(), n_ * n_);
+    }
+
+    // G^T u (n,) where the coordinates of `group` have moved by `length`.
+    void gradient(const std::vector<int>& group, double length, std::vector<double>& out) {
+        std::vector<double> move(n_, 0.0), x(x_);
+        for (const int j : group) move[j] = length;
+        double time = time_;
+        closures_.move(move.data(), x, time);
+        closures_.evaluate(x, time);
+        std::fill(out.begin(), out.end(), 0.0);
+        for (int i = 0; i < rank_; ++i)
+            add(u_[i], &closures_.G[chosen_[i] * n_], out.data(), n_);
     }
 
     void fill_matrix(std::vector<double>& matrix) const {

@@ -83,9 +83,12 @@ double torsion_spring(const ForceElement& e, double position, double rate) {
     return -(e.stiffness * (position - e.rest) + e.damping * rate);
 }
 
+double beyond_limits(const ForceElement& e, double position) {
+    return std::max(position - e.numbers[1], 0.0) + std::min(position - e.numbers[0], 0.0);
+}
+
 double limit_spring(const ForceElement& e, double position, double rate) {
-    const double lower = e.numbers[0], upper = e.numbers[1], depth = e.numbers[2];
-    const double beyond = std::max(position - upper, 0.0) + std::min(position - lower, 0.0);
+    const double beyond = beyond_limits(e, position), depth = e.numbers[2];
     if (beyond == 0.0) return 0.0;
     const double x = std::min(std::abs(beyond) / depth, 1.0);
     const double contact = x * x * x * (10.0 + x * (6.0 * x - 15.0));
@@ -160,6 +163,56 @@ void bushing(const ForceElement& e, const pinocchio::Data& data, BushingStep* st
     const Vector3d world_force = Tb.rotation() * force;
     const Vector3d world_moment = Tb.rotation() * (L * moment);
     add_wrench(e, data, -world_force, -world_moment, Ta.translation(), tau);
+}
+
+// The integral of k d S(d / depth).
+double limit_spring_energy(const ForceElement& e, double position) {
+    const double beyond = std::abs(beyond_limits(e, position)), depth = e.numbers[2];
+    const double x = std::min(beyond / depth, 1.0);
+    const double inside =
+        depth * depth * std::pow(x, 5) * (2.0 + x * (6.0 / 7.0 * x - 2.5));
+    return e.stiffness * (inside + 0.5 * std::max(beyond * beyond - depth * depth, 0.0));
+}
+
+double bushing_energy(const ForceElement& e, const pinocchio::Data& data) {
+    const SE3 relative = placement(e.b, data).actInv(placement(e.a, data));
+    const Vector3d shift = relative.translation(), turn = pinocchio::log3(relative.rotation());
+    double out = 0.0;
+    for (int i = 0; i < 3; ++i)
+        out += e.numbers[i] * shift[i] * shift[i] + e.numbers[3 + i] * turn[i] * turn[i];
+    return 0.5 * out;
+}
+
+double coupling_stretch(const ForceElement& e, const double* q) {
+    double out = -e.rest;
+    for (std::size_t k = 0; k < e.columns.size(); ++k) out += e.signs[k] * q[e.positions[k]];
+    return out;
+}
+
+double linear_energy(double stiffness, double stretch) {
+    return 0.5 * stiffness * stretch * stretch;
+}
+
+double energy(const ForceElement& e, const pinocchio::Data& data, const double* q) {
+    switch (e.kind) {
+        case ForceKind::spring_damper:
+            return linear_energy(e.stiffness, (placement(e.a, data).translation() -
+                                               placement(e.b, data).translation())
+                                                      .norm() -
+                                                  e.rest);
+        case ForceKind::torsion_spring:
+            return linear_energy(e.stiffness, q[e.in_q] - e.rest);
+        case ForceKind::bushing:
+            return bushing_energy(e, data);
+        case ForceKind::limit_spring:
+            return limit_spring_energy(e, q[e.in_q]);
+        case ForceKind::coupling_spring:
+            return linear_energy(e.stiffness, coupling_stretch(e, q));
+        case ForceKind::joint_torque:
+        case ForceKind::wrench:
+            break;
+    }
+    return 0.0;
 }
 
 }  // namespace
@@ -292,6 +345,13 @@ void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 break;
         }
     }
+}
+
+double potential_energy(const std::vector<ForceElement>& elements,
+                        const pinocchio_model::Workspace& work, const double* q) {
+    double out = 0.0;
+    for (const ForceElement& e : elements) out += energy(e, work.data, q);
+    return out;
 }
 
 }  // namespace srm

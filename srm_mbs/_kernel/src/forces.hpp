@@ -120,4 +120,8 @@ void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 const pinocchio_model::Workspace& work, double t, const double* q,
                 const double* v, std::vector<BushingStep>& step, double* tau, ForceLaws* laws);
 
+// Potential energy (J) of those that have one; the workspace holds the placements.
+double potential_energy(const std::vector<ForceElement>& elements,
+                        const pinocchio_model::Workspace& work, const double* q);
+
 }  // namespace srm

@@ -52,7 +52,7 @@ private:
     const int nv_, n_, count_;
     const double gamma_;
     const std::vector<double> unit_;
-    const Constants constants_;
+    const Constants& constants_;
     bool known_ = false;
     double known_time_ = 0.0, k_ = 0.0;
     std::vector<double> known_state_, known_rate_, known_laws_;

@@ -38,7 +38,7 @@ const double* vector_of(const Array& array, int size, const char* name) {
 }
 
 std::vector<double> optional_vector(nb::handle object) {
-    return object.is_none() ? std::vector<double>{} : to_vector(nb::cast<Array>(object));
+    return object.is_none() ? std::vector<double>{} : to_vector(object);
 }
 
 // A view of `values`, which `owner` keeps alive.
@@ -159,6 +159,13 @@ struct PySystem {
         return out;
     }
 
+    // What a run from `state` at t begins with; its first stage is evaluated directly.
+    IntegratorState first_stage(double t, const Array& state, bool stiff) {
+        IntegratorState out = srm::first_stage(*system, t, vector_of(state, state_size(), "state"));
+        out.stiff = stiff;
+        return out;
+    }
+
     // Evaluates the stage `repeats` times, to measure one evaluation in the loop.
     void repeat(double t, const Array& state, long repeats) {
         std::vector<double> rate(2 * system->nv);
@@ -177,6 +184,67 @@ struct PySystem {
         for (long i = 0; i < repeats; ++i) system->tree_terms(x);
     }
 
+    // Quantities of n states; with the interpreter's lock held, so that threads may share the
+    // workspace.  count_of: their number, from times t (n,) and rows of `width` numbers.
+    static std::size_t count_of(const Array& t, const Array& rows, int width) {
+        const std::size_t n = t.size();
+        if (t.ndim() != 1 || rows.size() != n * static_cast<std::size_t>(width))
+            throw nb::value_error("times and states do not fit");
+        return n;
+    }
+
+    // g - s and G v - s' (n, rows).
+    nb::tuple closure_errors(const Array& t, const Array& states) {
+        const std::size_t n = count_of(t, states, state_size()), nx = state_size();
+        const auto rows = static_cast<std::size_t>(system->rows());
+        std::vector<double> g(n * rows), rates(n * rows);
+        for (std::size_t i = 0; i < n; ++i)
+            system->closure_errors(t.data()[i], states.data() + i * nx, g.data() + i * rows,
+                                   rates.data() + i * rows);
+        return nb::make_tuple(owned_array(std::move(g), {n, rows}),
+                              owned_array(std::move(rates), {n, rows}));
+    }
+
+    // G (n, rows, nv) at the configurations q (n, nq), with drives and -s' as its last column
+    // (n, rows, nv + 1).
+    nb::object jacobians(const Array& t, const Array& q) {
+        const std::size_t n = count_of(t, q, system->nq);
+        const auto rows = static_cast<std::size_t>(system->rows());
+        const int width = system->nv + (system->driven() ? 1 : 0);
+        const std::size_t size = rows * static_cast<std::size_t>(width);
+        std::vector<double> G(n * size), g(rows);
+        for (std::size_t i = 0; i < n; ++i)
+            system->closures_at(t.data()[i], q.data() + i * system->nq, g.data(),
+                                G.data() + i * size, width);
+        return owned_array(std::move(G), {n, rows, static_cast<std::size_t>(width)});
+    }
+
+    // Kinetic and potential energy (n, 2).
+    nb::object energies(const Array& states) {
+        const std::size_t nx = state_size();
+        if (states.ndim() != 2 || states.shape(1) != nx)
+            throw nb::value_error("states has another shape");
+        const std::size_t n = states.shape(0);
+        std::vector<double> out(2 * n);
+        for (std::size_t i = 0; i < n; ++i) {
+            const auto found = system->energies(states.data() + i * nx);
+            std::copy(found.begin(), found.end(), out.begin() + 2 * i);
+        }
+        return owned_array(std::move(out), {n, 2});
+    }
+
+    // Powers (n, elements) of each of `elements` by itself, or of its force at rest.
+    nb::object powers(const Array& t, const Array& states,
+                      const std::vector<ForceElement>& elements, bool resting) {
+        const std::size_t n = count_of(t, states, state_size()), nx = state_size();
+        const std::size_t m = elements.size();
+        std::vector<double> out(n * m);
+        for (std::size_t i = 0; i < n; ++i)
+            system->powers(t.data()[i], states.data() + i * nx, elements, resting,
+                           out.data() + i * m);
+        return owned_array(std::move(out), {n, m});
+    }
+
     void hold(double t, const Array& force, bool keep) {
         system->hold(t, vector_of(force, system->nv, "force"), keep);
     }
@@ -193,6 +261,7 @@ void bind_system(nb::module_& m) {
         .def(nb::init<nb::object, const SystemData&, nb::object>(), nb::arg("model"),
              nb::arg("data"), nb::arg("controller").none())
         .def("terms", &PySystem::terms, nb::arg("t"), nb::arg("state"), nb::arg("threshold") = -1.0)
+        .def("first_stage", &PySystem::first_stage)
         .def("repeat", &PySystem::repeat)
         .def("repeat_tree", &PySystem::repeat_tree)
         .def("between",
@@ -201,6 +270,11 @@ void bind_system(nb::module_& m) {
              [](PySystem& s, double t, const Array& state) {
                  s.system->begin_step(t, vector_of(state, s.state_size(), "state"));
              })
+        .def("closure_errors", &PySystem::closure_errors)
+        .def("jacobians", &PySystem::jacobians)
+        .def("energies", &PySystem::energies)
+        .def("powers", &PySystem::powers, nb::arg("t"), nb::arg("states"), nb::arg("elements"),
+             nb::arg("resting"))
         .def("hold", &PySystem::hold)
         .def("renew", &PySystem::renew, nb::arg("unit"), nb::arg("gap_scale"),
              nb::arg("damping").none(), nb::arg("friction").none())
@@ -278,7 +352,8 @@ void bind_branch_motion(nb::module_& m) {
         .def_ro("sigma", &BranchPoint::sigma);
     nb::class_<PyBranchMotion>(
         m, "BranchMotion", nb::type_slots(collected<PyBranchMotion, &PyBranchMotion::owner>()))
-        .def(nb::init<nb::object, const ButcherTableau&, const Constants&, const ErrorNorm&>())
+        .def(nb::init<nb::object, const ButcherTableau&, const Constants&, const ErrorNorm&>(),
+             nb::keep_alive<1, 3>(), nb::keep_alive<1, 4>(), nb::keep_alive<1, 5>())
         .def("nodes", &PyBranchMotion::nodes, nb::arg("times"), nb::arg("values"),
              nb::arg("points"), nb::arg("extrapolated"), nb::arg("direct"),
              nb::arg("curve").none());
@@ -336,6 +411,7 @@ private:
 struct PyRecords {
     StepRecords records;
     std::vector<double> end_rate;
+    std::vector<double> numbers;  // (5, steps)
     std::size_t nx, n, stages, corrected;  // stages: those of a step and its end
 };
 
@@ -346,23 +422,18 @@ struct PyRun {
     const BranchGuard* guard = nullptr;
 
     // stiff: the scheme where the problem is stiff, if it is another.
-    PyRun(nb::object system_, const ButcherTableau& scheme,
-          const std::optional<ButcherTableau>& stiff, const Constants& constants,
-          const ErrorNorm& norm, const IntegratorState& memory, const Array& state,
-          const SmoothIntervals& intervals, const RunOptions& options)
+    PyRun(nb::object system_, const ButcherTableau& scheme, const ButcherTableau* stiff,
+          const Constants& constants, const ErrorNorm& norm, const IntegratorState& memory,
+          const Array& state, const SmoothIntervals& intervals, const RunOptions& options)
         : system(std::move(system_)), s(*nb::cast<PySystem&>(system).system) {
         check_size("ErrorNorm.atol", norm.atol.size());
         check(memory);
         std::vector<double> start = checked_state(state);
         auto control = make_control(scheme, stiff ? *stiff : scheme, constants, norm, memory,
                                     start, intervals, options);
-        std::unique_ptr<SplitStep> other;
-        if (stiff) {
-            if (stiff->stages() != scheme.stages())
-                throw nb::value_error("the schemes have other numbers of stages");
-            other = std::make_unique<SplitStep>(s, *stiff, constants, norm);
-        }
-        run = std::make_unique<Run>(s, SplitStep(s, scheme, constants, norm), std::move(other),
+        if (stiff && stiff->stages() != scheme.stages())
+            throw nb::value_error("the schemes have other numbers of stages");
+        run = std::make_unique<Run>(s, SplitStep(s, scheme, constants, norm), stiff,
                                     std::move(control), memory, std::move(start), intervals,
                                     options);
     }
@@ -487,6 +558,9 @@ struct PyRun {
         run->records.clear();
         out.records.times.insert(out.records.times.begin(), t0);
         out.records.states.insert(out.records.states.begin(), start.begin(), start.end());
+        const StepRecords& r = out.records;
+        for (const auto* values : {&r.ranks, &r.error_ratios, &r.placements, &r.held, &r.stiff})
+            out.numbers.insert(out.numbers.end(), values->begin(), values->end());
         out.end_rate = run->end_rate;
         out.nx = start.size();
         out.n = 2 * static_cast<std::size_t>(s.nv);
@@ -570,27 +644,31 @@ void bind_run(nb::module_& m) {
           });
     array("corrections", &StepRecords::corrections, matrix(&PyRecords::corrected, false));
     array("sigmas", &StepRecords::sigmas, matrix(&PyRecords::stages, false));
-    array("ranks", &StepRecords::ranks, flat);
-    array("error_ratios", &StepRecords::error_ratios, flat);
-    array("placements", &StepRecords::placements, flat);
-    array("held", &StepRecords::held, flat);
-    array("stiff", &StepRecords::stiff, flat);
     array("breaks", &StepRecords::breaks, flat);
     array("break_rates", &StepRecords::break_rates,
           [](const PyRecords& r, const std::vector<double>& values, nb::handle self) {
               return view(values, {r.records.breaks.size(), r.n}, self);
           });
-    records.def_prop_ro("end_rate", [](const PyRecords& r) { return owned_array(r.end_rate); })
+    // Rows: ranks, error ratios, placements, held, stiff.
+    records.def_prop_ro("numbers", [](nb::handle self) {
+        const PyRecords& r = *nb::inst_ptr<PyRecords>(self);
+        return view(r.numbers, {5, r.records.ranks.size()}, self);
+    });
+    records
+        .def_prop_ro("break_count", [](const PyRecords& r) { return r.records.breaks.size(); })
+        .def_prop_ro("end_rate", [](const PyRecords& r) { return owned_array(r.end_rate); })
         .def_prop_ro("zones", [](const PyRecords& r) { return r.records.zones; });
 
     nb::class_<PyStepDense>(m, "StepDense").def("__call__", &PyStepDense::at);
 
     nb::class_<PyRun>(m, "Run", nb::type_slots(collected<PyRun, &PyRun::system>()))
-        .def(nb::init<nb::object, const ButcherTableau&, const std::optional<ButcherTableau>&,
-                      const Constants&, const ErrorNorm&, const IntegratorState&, const Array&,
+        .def(nb::init<nb::object, const ButcherTableau&, const ButcherTableau*, const Constants&,
+                      const ErrorNorm&, const IntegratorState&, const Array&,
                       const SmoothIntervals&, const RunOptions&>(),
-             nb::arg("system"), nb::arg("scheme"), nb::arg("stiff").none(), nb::arg("constants"), nb::arg("norm"),
-             nb::arg("memory"), nb::arg("state"), nb::arg("intervals"), nb::arg("options"))
+             nb::arg("system"), nb::arg("scheme"), nb::arg("stiff").none(), nb::arg("constants"),
+             nb::arg("norm"), nb::arg("memory"), nb::arg("state"), nb::arg("intervals"),
+             nb::arg("options"), nb::keep_alive<1, 3>(), nb::keep_alive<1, 4>(),
+             nb::keep_alive<1, 5>(), nb::keep_alive<1, 6>(), nb::keep_alive<1, 10>())
         .def("advance", &PyRun::advance, nb::arg("steps"), nb::arg("seconds"))
         .def("attempt_from", &PyRun::attempt_from)
         .def("go_on", &PyRun::go_on, nb::arg("end"), nb::arg("first"), nb::arg("last"),

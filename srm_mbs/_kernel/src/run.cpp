@@ -50,7 +50,7 @@ void StepRecords::clear() {
     zones.clear();
 }
 
-Run::Run(System& system, SplitStep step_, std::unique_ptr<SplitStep> stiff_step,
+Run::Run(System& system, SplitStep step_, const ButcherTableau* stiff,
          std::unique_ptr<Control> control_, IntegratorState memory_, std::vector<double> state_,
          SmoothIntervals intervals, const RunOptions& options)
     : system(system),
@@ -59,7 +59,7 @@ Run::Run(System& system, SplitStep step_, std::unique_ptr<SplitStep> stiff_step,
       memory(std::move(memory_)),
       state(std::move(state_)),
       end_rate(2 * system.nv),
-      stiff_step_(std::move(stiff_step)),
+      stiff_(stiff),
       intervals_(std::move(intervals)),
       eps_factor_(options.eps_factor),
       eps_power_(options.eps_power),
@@ -74,6 +74,12 @@ Run::Run(System& system, SplitStep step_, std::unique_ptr<SplitStep> stiff_step,
       collocation_(options.collocation),
       one_freedom_(system.nv + (system.driven() ? 1 : 0) - system.structural_rank() == 1) {
     enter_interval();
+}
+
+SplitStep& Run::stepper() {
+    if (!memory.stiff || !stiff_) return step;
+    if (!stiff_step_) stiff_step_.emplace(system, *stiff_, step.constants, step.norm);
+    return *stiff_step_;
 }
 
 void Run::enter_interval() {

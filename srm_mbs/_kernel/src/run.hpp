@@ -111,8 +111,9 @@ struct RunSnapshot {
 
 class Run {
 public:
-    // stiff_step: makes the steps where the problem is stiff; may be null.
-    Run(System& system, SplitStep step, std::unique_ptr<SplitStep> stiff_step,
+    // `stiff`: the scheme where the problem is stiff; may be null.  The structs of the step, `stiff`
+    // and `options` are not copied: their owner outlives the run.
+    Run(System& system, SplitStep step, const ButcherTableau* stiff,
         std::unique_ptr<Control> control, IntegratorState memory, std::vector<double> state,
         SmoothIntervals intervals, const RunOptions& options);
 
@@ -179,9 +180,10 @@ private:
     double direct_from() const;
 
     const Constants& constants() const { return step.constants; }
-    SplitStep& stepper() { return memory.stiff && stiff_step_ ? *stiff_step_ : step; }
+    SplitStep& stepper();
 
-    std::unique_ptr<SplitStep> stiff_step_;
+    const ButcherTableau* const stiff_;
+    std::optional<SplitStep> stiff_step_;  // made where the problem is first found to be stiff
     SplitStep* made_by_ = &step;
 
     SmoothIntervals intervals_;
@@ -202,7 +204,7 @@ private:
     bool inaccurate_ = false;  // the first stage after a jump: Python has to look at it
     bool examines_;
     double singular_tolerance_;
-    Collocation collocation_;
+    const Collocation& collocation_;
     const bool one_freedom_;  // the closed configurations are curves, which may be followed
     bool known_ = false;      // the passage ahead has been examined
     bool quiet_ = false;      // the last step was

@@ -73,17 +73,34 @@ double initial_step(System& system, const ErrorNorm& norm, double t, const doubl
     return std::min({longest, tau * std::pow(change, 1.0 / order), span});
 }
 
-SplitStep::SplitStep(System& system, ButcherTableau scheme_, const Constants& constants_,
-                     ErrorNorm norm_)
-    : scheme(std::move(scheme_)),
-      norm(std::move(norm_)),
+IntegratorState first_stage(System& system, double t, const double* state) {
+    system.evaluate(t, state, System::ZoneView{});
+    const std::size_t nv = static_cast<std::size_t>(system.nv);
+    IntegratorState out;
+    out.rate.resize(2 * nv);
+    out.state_scale.resize(2 * nv);
+    system.rate(out.rate.data());
+    system.state_scale(state, out.state_scale.data());
+    out.sigma = system.sigma();
+    if (!system.constrained()) return out;
+    std::vector<double> multiplier(nv);
+    system.multiplier(multiplier.data());
+    out.history.emplace();
+    out.history->nv = system.nv;
+    out.history->clear();
+    out.history->extend(t, multiplier.data(), {}, {});
+    return out;
+}
+
+SplitStep::SplitStep(System& system, const ButcherTableau& scheme_, const Constants& constants_,
+                     const ErrorNorm& norm_)
+    : scheme(scheme_),
+      norm(norm_),
       constants(constants_),
       system_(system),
       nv_(system.nv),
       n_(2 * system.nv),
       nx_(system.nq + system.nv),
-      nodes_(system, constants_),
-      touching_(system, constants_),
       x_(nx_),
       delta_(n_),
       rate_(n_),
@@ -306,22 +323,26 @@ void SplitStep::prepare_branch(const IntegratorState& memory, double end, double
 bool SplitStep::solve_on_branch(double t, double start, const double* state,
                                 const IntegratorState& memory) {
     if (result.lost_branch) return false;
+    if (!nodes_) nodes_.emplace(system_, constants);
     bool found = true;
     if (away_.empty()) {
         away_ = memory.history->away;
         const bool known = !away_.empty();
-        if (!known) nodes_.find_direction(start, state, away_);
+        if (!known) nodes_->find_direction(start, state, away_);
         touches_ = !away_.empty() &&
                    system_.position_norm(away_.data()) > constants.longest_node_spacing;
-        if (touches_) found = touching_.prepare(start, state, memory.rate.data(), away_);
+        if (touches_) {
+            if (!touching_) touching_.emplace(system_, constants);
+            found = touching_->prepare(start, state, memory.rate.data(), away_);
+        }
         if (touches_ || !known) system_.evaluate(t, x_.data(), System::ZoneView{});
     }
     if (away_.empty() || !found)
         found = false;
     else if (touches_)
-        found = touching_.solve(t, x_.data(), nodes_);
+        found = touching_->solve(t, x_.data(), *nodes_);
     else
-        found = nodes_.solve(t, x_.data(), away_);
+        found = nodes_->solve(t, x_.data(), away_);
     result.lost_branch = !found;
     return found;
 }
@@ -470,8 +491,8 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
             if (solve_on_branch(time, t, state, memory)) {
                 noded_ = true;
                 noded_end_ = end;
-                x_ = nodes_.state;
-                rate_ = nodes_.rate;
+                x_ = nodes_->state;
+                rate_ = nodes_->rate;
                 system_.chart_rate(delta_.data(), rate_.data(), &r.rates[j * n]);
                 continue;
             }
@@ -508,11 +529,11 @@ void SplitStep::finish(double theta, bool constrained) {
         return;
     }
     if (noded_end_) {
-        r.state = nodes_.state;
-        r.end_rate = nodes_.rate;
-        r.correction = nodes_.moved;
-        r.multiplier = nodes_.multiplier;
-        r.away = nodes_.away;
+        r.state = nodes_->state;
+        r.end_rate = nodes_->rate;
+        r.correction = nodes_->moved;
+        r.multiplier = nodes_->multiplier;
+        r.away = nodes_->away;
         r.has_multiplier = true;
         return;
     }

@@ -75,6 +75,10 @@ struct IntegratorState {
     void check() const;
 };
 
+// The memory at the start of a run, from a direct evaluation of `state` at t: start in
+// split_step.py.
+IntegratorState first_stage(System& system, double t, const double* state);
+
 struct StepResult {
     double t = 0.0, h = 0.0;
     std::vector<double> state;        // (nx,), at the end, corrected
@@ -102,7 +106,9 @@ struct StepResult {
 // Makes steps; owns the memory that a step works in, so that none allocates.
 class SplitStep {
 public:
-    SplitStep(System& system, ButcherTableau scheme, const Constants& constants, ErrorNorm norm);
+    // The structs are not copied: their owner outlives the steps.
+    SplitStep(System& system, const ButcherTableau& scheme, const Constants& constants,
+              const ErrorNorm& norm);
 
     // One step from `state`, of whose end correction the fraction theta is applied.  Throws
     // EvaluationError.
@@ -112,9 +118,9 @@ public:
     void accept(IntegratorState& memory);
 
     StepResult result;
-    const ButcherTableau scheme;
-    const ErrorNorm norm;
-    const Constants constants;
+    const ButcherTableau& scheme;
+    const ErrorNorm& norm;
+    const Constants& constants;
 
 private:
     // How the stages of the step are evaluated next to a singular configuration.
@@ -155,8 +161,9 @@ private:
     // branch; one of them was; the end was.
     bool lingers_ = false, noded_ = false, noded_end_ = false;
     bool touches_ = false;  // branches touch there
-    BranchNodes nodes_;
-    TouchingBranch touching_;
+    // Made by the first step that lingers.
+    std::optional<BranchNodes> nodes_;
+    std::optional<TouchingBranch> touching_;
     // Of a linearly implicit scheme; with the weights (s, s) of the rates in its linear terms, over
     // gamma, and the sums of its rows (s,).
     std::unique_ptr<LinearStages> linear_;

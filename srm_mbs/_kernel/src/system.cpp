@@ -66,6 +66,7 @@ void ClosureRows::check() const {
 void JointRow::check() const {
     expect_size("in_q", in_q.size(), coefficients.size());
     expect_size("in_v", in_v.size(), coefficients.size());
+    if (!powers.empty()) expect_size("arguments", arguments.size(), coefficients.size());
 }
 
 void SystemData::check() const {
@@ -123,6 +124,22 @@ const pinocchio::Model& checked_model(const pinocchio::Model& model) {
     return model;
 }
 
+// Refuses joints and columns that the model does not have.
+void check_indices(const ForceElement& force, const pinocchio::Model& model) {
+    const long nq = model.nq, nv = model.nv, joints = model.njoints;
+    for (const Anchor* anchor : {&force.a, &force.b})
+        expect_within("Anchor.joint", anchor->joint, 0, joints - 1);
+    expect_within("ForceElement.columns", force.columns, 0, nv - 1);
+    expect_within("ForceElement.positions", force.positions, 0, nq - 1);
+    const bool torque = force.kind == ForceKind::joint_torque;
+    const long last = torque ? static_cast<long>(force.numbers.size()) : 1;
+    const bool on_joint = torque || force.kind == ForceKind::torsion_spring ||
+                          force.kind == ForceKind::limit_spring;
+    if (!on_joint) return;
+    expect_within("ForceElement.in_v", force.in_v, 0, nv - last);
+    if (!torque) expect_within("ForceElement.in_q", force.in_q, 0, nq - 1);
+}
+
 // Refuses rows, joints and columns that the model does not have.
 void check_indices(const SystemData& data, const pinocchio::Model& model) {
     const long nq = model.nq, nv = model.nv, rows = data.rows, joints = model.njoints;
@@ -155,19 +172,7 @@ void check_indices(const SystemData& data, const pinocchio::Model& model) {
         if (drive.in_v >= 0)
             expect_within("DrivenRow.in_q", drive.in_q, 0, nq - 1 - (drive.wraps ? 1 : 0));
     }
-    for (const ForceElement& force : data.forces) {
-        for (const Anchor* anchor : {&force.a, &force.b})
-            expect_within("Anchor.joint", anchor->joint, 0, joints - 1);
-        expect_within("ForceElement.columns", force.columns, 0, nv - 1);
-        expect_within("ForceElement.positions", force.positions, 0, nq - 1);
-        const bool torque = force.kind == ForceKind::joint_torque;
-        const long last = torque ? static_cast<long>(force.numbers.size()) : 1;
-        const bool on_joint = torque || force.kind == ForceKind::torsion_spring ||
-                              force.kind == ForceKind::limit_spring;
-        if (!on_joint) continue;
-        expect_within("ForceElement.in_v", force.in_v, 0, nv - last);
-        if (!torque) expect_within("ForceElement.in_q", force.in_q, 0, nq - 1);
-    }
+    for (const ForceElement& force : data.forces) check_indices(force, model);
     for (const GroupJoint& joint : data.groups) {
         const bool free = joint.group == Group::se3;
         expect_within("GroupJoint.group", static_cast<long>(joint.group), 0, 2);
@@ -196,6 +201,8 @@ System::System(const void* model, SystemData data, Controller controller)
                                       // A joint that mimics another adds entries off the tree.
                                       work_->model.mimicking_joints.empty() ? data_.algebra
                                                                             : "dense");
+    else
+        G_.resize(static_cast<std::size_t>(data_.rows) * nv);
     g_.resize(data_.rows);
     bias_.resize(data_.rows);
     pushed_.resize(data_.rows);
@@ -232,6 +239,17 @@ int System::rank() const { return closed_ ? projection_->rank : 0; }
 bool System::rank_deficient() const { return closed_ && projection_->rank_deficient; }
 bool System::held() const { return closed_ && projection_->held; }
 
+double* System::filled(int row) {
+    return closed_ ? projection_->filled(row) : &G_[static_cast<std::size_t>(row) * nv];
+}
+
+double* System::column(int row) {
+    if (closed_) return projection_->column(row);
+    double* const out = filled(row);
+    std::fill_n(out, nv, 0.0);
+    return out;
+}
+
 // All rows: g, Gdot v, and G into the columns of the projection.
 void System::update_closures(const double* q, bool with_bias) {
     for (const ClosureRows& closure : data_.closures) {
@@ -240,7 +258,7 @@ void System::update_closures(const double* q, bool with_bias) {
         if (!closure.alignments.empty()) update_alignments(closure, with_bias);
     }
     for (const JointRow& joints : data_.joint_rows) {
-        double* const out = projection_->column(joints.row);
+        double* const out = column(joints.row);
         double g = -joints.offset;
         for (std::size_t k = 0; k < joints.coefficients.size(); ++k) {
             out[joints.in_v[k]] = joints.coefficients[k];
@@ -248,20 +266,44 @@ void System::update_closures(const double* q, bool with_bias) {
         }
         g_[joints.row] = g;
         bias_[joints.row] = 0.0;
+        if (!joints.powers.empty()) update_powers(joints, q, with_bias);
     }
     for (const Elimination& e : data_.eliminations) {
-        double* const out = projection_->filled(e.row);
-        const double* const other = projection_->filled(e.other);
+        double* const out = filled(e.row);
+        const double* const other = filled(e.other);
         for (const int j : e.columns) out[j] -= e.factor * other[j];
         g_[e.row] -= e.factor * g_[e.other];
         if (with_bias) bias_[e.row] -= e.factor * bias_[e.other];
     }
 }
 
+// The powers of a joint row: P(y) of g, P'(y) b of G and P''(y) (b . v)^2 of Gdot v.
+void System::update_powers(const JointRow& joints, const double* q, bool with_bias) {
+    double y = 0.0, rate = 0.0;
+    for (std::size_t k = 0; k < joints.arguments.size(); ++k) {
+        y += joints.arguments[k] * q[joints.in_q[k]];
+        if (with_bias) rate += joints.arguments[k] * v_[joints.in_v[k]];
+    }
+    double value = 0.0, slope = 0.0, half_curvature = 0.0;  // Horner's scheme
+    const auto next = [&](double a) {
+        half_curvature = half_curvature * y + slope;
+        slope = slope * y + value;
+        value = value * y + a;
+    };
+    std::for_each(joints.powers.rbegin(), joints.powers.rend(), next);
+    next(0.0);
+    next(0.0);
+    g_[joints.row] -= value;
+    bias_[joints.row] = -2.0 * half_curvature * rate * rate;
+    double* const out = filled(joints.row);
+    for (std::size_t k = 0; k < joints.arguments.size(); ++k)
+        out[joints.in_v[k]] -= slope * joints.arguments[k];
+}
+
 // A row of G = (force, moment) J.
 void System::fill(const ClosureRows& closure, int row, const Vec& force, const Vec& moment) {
     const double* J = work_->data.J.data();
-    double* const out = projection_->column(row);
+    double* const out = column(row);
     for (std::size_t k = 0; k < closure.columns.size(); ++k) {
         const int j = closure.columns[k];
         const double* column = J + 6 * j;
@@ -516,7 +558,7 @@ void System::update_drives(double t, bool with_bias) {
                                              : q[drive.in_q];
             g_[row] = drive.factor * angle;
             bias_[row] = 0.0;
-            projection_->column(row)[drive.in_v] = drive.factor;
+            column(row)[drive.in_v] = drive.factor;
         }
         double s[3];
         drive.curve.at(t, s);
@@ -578,7 +620,9 @@ bool System::derivatives(const double* state, const double* a, double* by_forces
                          double* by_v) {
     using Matrix = Eigen::MatrixXd;
     auto& w = *work_;
+    const auto powers = [](const JointRow& row) { return !row.powers.empty(); };
     if (!data_.closures.empty() || !joined_.empty() || rank_deficient()) return false;
+    if (std::any_of(data_.joint_rows.begin(), data_.joint_rows.end(), powers)) return false;
     if (!w.model.mimicking_joints.empty() || !w.model.gravity.angular().isZero(0.0)) return false;
     Matrix M = Matrix::Zero(nv, nv), dq(M), dv(M), N;
     if (closed_) {
@@ -904,16 +948,100 @@ void System::working_forces(double* all, double* working) {
     for (int i = 0; i < nv; ++i) working[i] -= w.data.g[i];
 }
 
+const ColumnGroups& System::column_groups() {
+    if (!columns_.groups.empty()) return columns_;
+    std::vector<std::vector<int>> of_rows(data_.rows);
+    const auto extend = [&](int row, const std::vector<int>& columns) {
+        of_rows[row].insert(of_rows[row].end(), columns.begin(), columns.end());
+    };
+    for (const ClosureRows& closure : data_.closures)
+        for (std::size_t k = 0; k < closure.count(); ++k)
+            extend(closure.first_row + static_cast<int>(k), closure.columns);
+    for (const JointRow& joints : data_.joint_rows) extend(joints.row, joints.in_v);
+    for (const Elimination& e : data_.eliminations) extend(e.row, e.columns);
+    for (const DrivenRow& drive : data_.drives) {
+        if (drive.in_v >= 0) extend(drive.row, {drive.in_v});
+        extend(drive.row, {nv});
+    }
+    const int n = nv + (driven() ? 1 : 0);
+    std::vector<std::vector<bool>> touches(n, std::vector<bool>(n, false));
+    for (const std::vector<int>& columns : of_rows)
+        for (const int j : columns)
+            for (const int k : columns) touches[j][k] = true;
+    columns_.neighbours.resize(n);
+    std::vector<std::vector<bool>> taken;  // of each group, the coordinates next to its own
+    for (int j = 0; j < n; ++j) {
+        std::vector<int>& next_to = columns_.neighbours[j];
+        for (int k = 0; k < n; ++k)
+            if (touches[j][k]) next_to.push_back(k);
+        const auto fits = [&](const std::vector<bool>& group) {
+            return std::none_of(next_to.begin(), next_to.end(), [&](int k) { return group[k]; });
+        };
+        const auto found = std::find_if(taken.begin(), taken.end(), fits);
+        const auto place = static_cast<std::size_t>(found - taken.begin());
+        if (found == taken.end()) {
+            taken.emplace_back(n, false);
+            columns_.groups.emplace_back();
+        }
+        columns_.groups[place].push_back(j);
+        for (const int k : next_to) taken[place][k] = true;
+    }
+    return columns_;
+}
+
+void System::closure_errors(double t, const double* state, double* g, double* rates) {
+    move_bodies(state);
+    pinocchio::computeJointJacobians(work_->model, work_->data);
+    update_closures(state, false);
+    update_drives(t, false);
+    std::copy(g_.begin(), g_.end(), g);
+    for (int i = 0; i < data_.rows; ++i) rates[i] = dot(filled(i), state + nq, nv);
+    for (const DrivenRow& drive : data_.drives) rates[drive.row] -= pushed_[drive.row];
+}
+
+std::array<double, 2> System::energies(const double* state) {
+    auto& w = *work_;
+    std::copy(state, state + nq, w.q.data());
+    pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
+    mass_times(state + nq, v_.data());
+    double potential = potential_energy(data_.forces, w, state);
+    for (int i = 1; i < w.model.njoints; ++i) {
+        const auto& body = w.model.inertias[i];
+        potential -= body.mass() * w.model.gravity.linear().dot(w.data.oMi[i].act(body.lever()));
+    }
+    return {0.5 * dot(state + nq, v_.data(), nv), potential};
+}
+
+void System::powers(double t, const double* state, const std::vector<ForceElement>& elements,
+                    bool resting, double* out) {
+    auto& w = *work_;
+    const double* const v = state + nq;
+    std::copy(state, state + nq, w.q.data());
+    if (resting) w.v.setZero();
+    else std::copy(v, v + nv, w.v.data());
+    pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
+    pinocchio::computeJointJacobians(w.model, w.data);
+    std::vector<BushingStep> none;
+    std::vector<ForceElement> one(1);
+    for (std::size_t k = 0; k < elements.size(); ++k) {
+        check_indices(elements[k], w.model);
+        std::fill(f_.begin(), f_.end(), 0.0);
+        one[0] = elements[k];
+        add_forces(one, data_.coincident, w, t, state, w.v.data(), none, f_.data(), nullptr);
+        out[k] = dot(f_.data(), v, nv);
+    }
+}
+
 void System::closures_at(double t, const double* q, double* g, double* G, int width) {
     auto& w = *work_;
     t = std::min(std::max(t, first_), last_);
     std::copy(q, q + nq, w.q.data());
-    pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
+    pinocchio::computeJointJacobians(w.model, w.data, Argument(w.q));
     update_closures(q, false);
     update_drives(t, false);
     std::copy(g_.begin(), g_.end(), g);
     std::fill_n(G, static_cast<std::size_t>(data_.rows) * width, 0.0);
-    const auto copy = [&](int row, int j) { G[row * width + j] = projection_->filled(row)[j]; };
+    const auto copy = [&](int row, int j) { G[row * width + j] = filled(row)[j]; };
     for (const ClosureRows& closure : data_.closures)
         for (std::size_t k = 0; k < closure.count(); ++k)
             for (int j : closure.columns) copy(closure.first_row + static_cast<int>(k), j);

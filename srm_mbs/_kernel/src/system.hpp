@@ -55,9 +55,12 @@ struct ClosureRows {
     field(std::vector<double>, coefficients) \
     field(std::vector<int>, in_q)            \
     field(std::vector<int>, in_v)            \
-    field(double, offset)
+    field(double, offset)                    \
+    field(std::vector<double>, arguments)    \
+    field(std::vector<double>, powers)
 
-// A kept, scaled row of joint coordinates: sum c_i q_i - offset.
+// A kept, scaled row of joint coordinates: sum c_i q_i - offset - sum a_k y^k, y = sum b_i q_i,
+// with a_2, a_3, ... the powers; a linear row has neither arguments b_i nor powers.
 struct JointRow {
     SRM_FIELDS(SRM_JOINT_ROW)
 
@@ -124,6 +127,12 @@ struct SystemData {
     SRM_FIELDS(SRM_SYSTEM_DATA)
 
     void check() const;
+};
+
+// Coordinates of the closures, time the last one with drives.
+struct ColumnGroups {
+    std::vector<std::vector<int>> neighbours;  // of each, those with which it has a row in common
+    std::vector<std::vector<int>> groups;      // of coordinates without a common neighbour
 };
 
 class System {
@@ -198,7 +207,17 @@ public:
     // All rows at q and t, without velocities: g (rows,), and by rows G (rows, width) with the
     // derivative by t, where drives are, as its last column.
     void closures_at(double t, const double* q, double* g, double* G, int width);
+    // The coordinates that their differences may move together.
+    const ColumnGroups& column_groups();
     int rows() const { return data_.rows; }
+    // Of one state at a time, with all terms of other states lost: g - s and G v - s' (rows,); the
+    // kinetic and the potential energy, of gravity and of springs; and the powers (forces,) of
+    // `elements`, each by itself, at the rates of the state or, if it is `resting`, those of its
+    // force at rest.
+    void closure_errors(double t, const double* state, double* g, double* rates);
+    std::array<double, 2> energies(const double* state);
+    void powers(double t, const double* state, const std::vector<ForceElement>& elements,
+                bool resting, double* out);
     // Of the stage evaluated last: M x (nv,), all forces but those of closures (nv,), those among
     // them but those of inertia (nv,), and Gdot v - s'' (rows,).
     void mass_times(const double* x, double* out) const;
@@ -247,7 +266,11 @@ public:
 private:
     Pattern pattern() const;
     void move_bodies(const double* state);
+    // Row `row` of G (nv,), cleared; and after it was written.
+    double* column(int row);
+    double* filled(int row);
     void update_closures(const double* q, bool with_bias);
+    void update_powers(const JointRow& joints, const double* q, bool with_bias);
     void update_positions(const ClosureRows& closure, bool with_bias);
     void update_alignments(const ClosureRows& closure, bool with_bias);
     void fill(const ClosureRows& closure, int row, const Vec& force, const Vec& moment);
@@ -269,11 +292,13 @@ private:
     std::vector<double> factors_;  // (nv, nv), of M of an open tree
     std::vector<int> pivots_;
     bool tracks_laws_ = false;
+    ColumnGroups columns_;  // when first asked for
     std::vector<double> held_from_, held_;  // times (s), and forces (k, nv)
     SystemData data_;
     Controller controller_;
     std::unique_ptr<pinocchio_model::Workspace> work_;
     std::unique_ptr<Projection> projection_;
+    std::vector<double> G_;  // (rows, nv), of a system without algebra of its closures
     bool closed_, flat_, on_several_, predicted_ = false;
     std::vector<BushingStep> bushings_;  // in the step that is made
     std::vector<double> g_, bias_, pushed_, f_, v_, rate_, prediction_, white_, acted_;

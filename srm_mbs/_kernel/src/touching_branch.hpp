@@ -31,7 +31,7 @@ private:
     void weigh(const std::vector<double>& places, int count);
 
     System& system_;
-    const Constants constants_;
+    const Constants& constants_;
     const int nv_, nx_;
     std::vector<double> along_, w_, bend_;         // (nv,)
     std::vector<double> nodes_;                    // (k, nx), the first ones on both sides first

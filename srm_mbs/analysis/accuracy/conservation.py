@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srm_mbs.analysis.accuracy.error_estimate import sample_times
-from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
+from srm_mbs.analysis.accuracy.error_estimate import even_times
 from srm_mbs.dynamics.scaling import constraint_angles
 from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.simulation.result import SimulationResult
@@ -24,7 +23,7 @@ class Drift:
     position, rate
         Norms over all rows of g, in ``unit``, and of G v, in ``unit``/s, at the ends of steps.
     between_position, between_rate
-        The same with the dense output at evenly spaced times between them.
+        The same, also with the dense output at evenly spaced times between them.
     relative
         ``position`` over the scene diagonal, or 1 rad.
     """
@@ -72,14 +71,16 @@ def drift_of(solution: SimulationResult) -> tuple[Drift, ...]:
         ends = part.steps.times
         if part.steps.stop is not None:  # an event within the last step
             ends = ends[:-1]
-        runs = [part.at(times) for times in (ends, sample_times(part))]
-        errors = [e for run in runs for e in constraint_errors(mechanism, run.t, run.q, run.v)]
+        at_ends = part.t_eval is None and len(part.t) == len(ends)
+        runs = [part if at_ends else part.at(ends), part.at(even_times(part))]
+        errors = [e for run in runs for e in run.observables.closure_errors(run.t, run.q, run.v)]
         angles = constraint_angles(mechanism)
         length = mechanism.structure.units.length
         for unit, own, scale in (("m", ~angles, length), ("rad", angles, 1.0)):
             if own.any():
                 largest = [float(np.linalg.norm(e[:, own], axis=1).max()) for e in errors]
-                found.setdefault(unit, []).append([*largest, scale])
+                between = [max(pair) for pair in zip(largest[:2], largest[2:])]
+                found.setdefault(unit, []).append([*largest[:2], *between, scale])
     worst = {unit: np.max(parts, axis=0).tolist() for unit, parts in found.items()}
     return tuple(
         Drift(unit, *(*largest, largest[0] / scale)) for unit, (*largest, scale) in worst.items()

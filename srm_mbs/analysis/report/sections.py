@@ -22,7 +22,7 @@ from srm_mbs.analysis.summary import (
     run_rows,
 )
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError
+from srm_mbs.errors import ControllerError, EvaluationError, InputError
 from srm_mbs.formats.files import file_name
 from srm_mbs.integration.methods.tableaus import TABLEAUS
 from srm_mbs.integration.singular_passages import Crossing
@@ -52,6 +52,8 @@ PIXELS_PER_INCH = 160
 SMALLEST_DIFFERENCE = 1e-9
 """Smallest difference that is drawn, over the largest: zeros at the start would make the axis
 long."""
+MAX_STATES = 1000
+"""Most states at which reactions are computed for the table of the largest ones."""
 NOT_COMPUTED = "not computed"
 
 FREEDOM = {
@@ -97,7 +99,7 @@ PICTURES = {
     "of the steps over time.",
     "state": "Positions and rates of the joints over time.",
     "balance": "Kinetic and potential energy, the work that was done, and the residual.",
-    "reactions": "Forces and moments in the closures of the loops over time.",
+    "reactions": "Forces and moments in the closures of the loops and in the joints over time.",
     "sigma": "Distance from singular configurations (0 on one), and how the steps were chosen.",
 }
 """Kinds of plots of a report, each with its caption."""
@@ -191,6 +193,7 @@ def run_data(solution: SimulationResult) -> dict[str, Any]:
         ],
         "bifurcations": [str(bifurcation) for bifurcation in solution.bifurcations],
         "events": _events(solution),
+        "reactions": reaction_rows(solution),
         **_passages(solution),
     }
 
@@ -222,6 +225,30 @@ def _settings(solution: SimulationResult) -> list[tuple[str, str]]:
         rows.append(("times that steps avoid", f"{times} s"))
     if settings.controlled:
         rows.append(("controller or forces in Python", "yes"))
+    return rows
+
+
+def reaction_rows(solution: SimulationResult) -> list[tuple[str, ...]]:
+    """Largest force and moment of each closure and joint at the ends of the steps, with their
+    times: (name, N, s, N m, s).  None for a loaded run that had a controller."""
+    times = (
+        solution.t
+        if len(solution.t) <= MAX_STATES
+        else solution.t[:: -(-len(solution.t) // MAX_STATES)]
+    )
+    run = solution if len(times) == len(solution.t) else solution.at(times)
+    try:
+        tables = {"closure": run.reactions, "joint": run.joint_reactions}
+    except (InputError, ControllerError, EvaluationError):
+        return []
+    rows = []
+    for kind, table in tables.items():
+        for name, wrench in table.items():
+            cells = [f"{kind} {name}"]
+            for part in (wrench[:, :3], wrench[:, 3:]):
+                sizes = np.linalg.norm(part, axis=1)
+                cells += [f"{sizes.max():.4g}", f"{run.t[int(np.argmax(sizes))]:.4g}"]
+            rows.append(tuple(cells))
     return rows
 
 
@@ -280,8 +307,6 @@ def pictures_data(
     for kind in kinds:
         if kind == "sigma" and not solution.crossings:
             continue  # the plot of kind "run" shows it
-        if kind == "reactions" and not solution.mechanism.constrained:
-            continue
         try:
             figure = plot_solution(solution, kind=kind)
         except InputError as error:

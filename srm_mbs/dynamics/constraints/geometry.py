@@ -24,14 +24,14 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
-from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.projection import symmetric
-from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
+from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, all_rows
 from srm_mbs.dynamics.constraints.rows import LoopKinematics, world_jacobian
 from srm_mbs.dynamics.constraints.structure import DEPENDENT, ROUNDING_ROW, structure_of
 from srm_mbs.dynamics.scaling import constraint_units, coordinate_units, row_units
 from srm_mbs.model.drives import in_order_of_rows, positions
-from srm_mbs.model.mechanism import MechanismData
+from srm_mbs.model.mechanism import MechanismData, per_model, per_start
 
 
 class ClosureGeometry:
@@ -63,7 +63,7 @@ class ClosureGeometry:
         self.model = mechanism.model.copy()
         self.model.gravity.linear = np.zeros(3)
         self.data = workspace(self.model)
-        self.rows = LoopKinematics(self.model, mechanism.loops)
+        self.rows = _loop_rows(mechanism).copy_workspace()
         self.units = coordinate_units(mechanism, start, np.zeros(self.model.nv))
         self.unit = self.coordinate_unit = self.units.coordinate
         self.row_unit = row_units(mechanism, self.units)
@@ -86,6 +86,10 @@ class ClosureGeometry:
 
         One size for the lengths of a loop and one for its alignments; 1 where all are zero.
         """
+        at_start = self.start is self.mechanism.q0
+        return _row_size_at_start(self.mechanism) if at_start else self._measured_row_size()
+
+    def _measured_row_size(self) -> FloatArray:
         rng = np.random.default_rng(0)
         squares = np.zeros(len(self.row_unit))
         uncancelled = np.zeros(2)
@@ -122,28 +126,51 @@ class ClosureGeometry:
         size = (self.row_unit * self.row_size).tolist()
         return [(e.row, e.other, e.factor * size[e.other] / size[e.row]) for e in eliminations]
 
-    def _without_shares(self, q: FloatArray) -> FloatArray:
-        G = self.normalised(q)
+    def _without_shares(self, normalised: FloatArray) -> FloatArray:
+        """``normalised`` rows (..., rows, n) after the eliminations."""
+        G = normalised.copy()
         for row, other, share in self._shares:
-            G[row] -= share * G[other]
+            G[..., row, :] -= share * G[..., other, :]
         return G
 
     @cached_property
     def _left(self) -> FloatArray:
         """Norm of each row (rows,) after the eliminations, over that before them, at q0."""
-        start = self.at(self.mechanism.q0, 0.0)
+        normalised = self.normalised(self.at(self.mechanism.q0, 0.0))
         before, left = (
-            np.linalg.norm(rows, axis=1)
-            for rows in (self.normalised(start), self._without_shares(start))
+            np.linalg.norm(rows, axis=1) for rows in (normalised, self._without_shares(normalised))
         )
-        return np.where(left > DEPENDENT * before, left / np.maximum(before, left), 1.0)
+        depends = ~(left > DEPENDENT * before)
+        left[depends] = before[depends] = 1.0  # a row of zeros depends on any
+        shares: FloatArray = left / np.maximum(before, left)
+        return shares
+
+    def _separate(self, normalised: FloatArray) -> FloatArray:
+        if not self._shares:
+            return normalised
+        out: FloatArray = self._without_shares(normalised) / self._left[:, None]
+        return out
 
     def separated(self, q: FloatArray) -> FloatArray:
         """As :meth:`normalised`, with the difference in place of one of two nearly parallel rows of
         closures between the same bodies, scaled to their norm.
 
         Otherwise a singular value that is small everywhere would hide singular configurations."""
-        return self._without_shares(q) / self._left[:, None] if self._shares else self.normalised(q)
+        return self._separate(self.normalised(q))
+
+    def normalised_rows(self, jacobians: FloatArray) -> FloatArray:
+        """As :meth:`normalised`, from the rows (..., rows, n) of unscaled Jacobians, of closures
+        and drives (:meth:`srm_mbs.dynamics.observables.Observables.jacobians`)."""
+        return jacobians * self._row_factors
+
+    @cached_property
+    def _row_factors(self) -> FloatArray:
+        """Factors (rows, n) from entries of G to those of normalised rows."""
+        return self.unit / (self.row_unit * self.row_size)[:, None]
+
+    def separated_rows(self, jacobians: FloatArray) -> FloatArray:
+        """As :meth:`separated`, from the rows that :meth:`normalised_rows` takes."""
+        return self._separate(self.normalised_rows(jacobians))
 
     def bias(self, q: FloatArray, u: FloatArray) -> FloatArray:
         """Gdot v, rows over their usual size, for the rates u (nv,) in units."""
@@ -173,6 +200,18 @@ class ClosureGeometry:
     def difference(self, a: FloatArray, b: FloatArray) -> FloatArray:
         """Motion (nv,) from a to b, in units."""
         return pin.difference(self.model, a, b) / self.unit  # type: ignore[no-any-return]
+
+
+@per_model
+def _loop_rows(mechanism: MechanismData) -> LoopKinematics:
+    """The rows of the loops, unscaled; geometries copy their workspace."""
+    return LoopKinematics(mechanism.model, mechanism.loops)
+
+
+@per_start
+def _row_size_at_start(mechanism: MechanismData) -> FloatArray:
+    """:attr:`ClosureGeometry.row_size` with units measured at q0."""
+    return ClosureGeometry(mechanism, mechanism.q0)._measured_row_size()
 
 
 class DriveRows:
@@ -301,3 +340,16 @@ def geometry_of(mechanism: MechanismData, q: FloatArray, t: float | None = None)
     """The closures of a mechanism, and its drives if it has any; parameters as for
     :class:`DrivenGeometry`."""
     return DrivenGeometry(mechanism, q, t) if mechanism.drives else ClosureGeometry(mechanism, q)
+
+
+def separated_pattern(mechanism: MechanismData) -> BoolArray:
+    """Which entries of the separated rows of :func:`geometry_of` may differ from zero."""
+    rows = all_rows(mechanism)
+    pattern = rows.pattern()
+    for elimination in structure_of(mechanism).eliminations:
+        pattern[elimination.row] |= pattern[elimination.other]
+    if not mechanism.drives:
+        return pattern
+    driven = np.zeros((len(pattern), 1), dtype=bool)
+    driven[rows.driven_rows] = True
+    return np.hstack([pattern, driven])

@@ -14,9 +14,20 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, DriveRows
+from srm_mbs.dynamics.constraints.rheonomic import driven_closures
 from srm_mbs.dynamics.constraints.row_algebra import null_basis
 from srm_mbs.dynamics.constraints.rows import world_jacobian
 from srm_mbs.dynamics.constraints.structure import ManifoldSampler, row_names, structure_of
+from srm_mbs.dynamics.constraints.wrenches import (
+    Placements,
+    about_origin,
+    add_between,
+    bodies_of,
+    moved,
+    row_wrenches,
+    sums_of_subtrees,
+)
+from srm_mbs.dynamics.scaling import constraint_units
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 RESTARTS = 4
@@ -25,6 +36,9 @@ RANK = 1e-7
 """Singular value of normalised rows, and rate in units, below which it counts as zero."""
 DETERMINED = 1e-8
 """Part of a row's square norm outside the row space below which its multiplier is unique."""
+
+COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
+"""Names of the components of a wrench."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +79,9 @@ class Mobility:
         Rows, ``loop.row`` or the name of a drive, whose multipliers equilibrium does not
         determine: redundant ones, and those that depend on each other.  Reactions give the values
         of least norm.
+    indeterminate_joints
+        Components of what the joints of the tree carry that depend on these multipliers:
+        ``joint.fx`` to ``joint.mz``, force and moment along the axes of the world.
     unreachable_joints
         Joints that no motion of the mechanism moves.
     idle
@@ -81,6 +98,7 @@ class Mobility:
     redundant_rows: tuple[str, ...]
     pivoted_redundancy: int
     indeterminate_rows: tuple[str, ...]
+    indeterminate_joints: tuple[str, ...]
     unreachable_joints: tuple[str, ...]
     idle: tuple[IdleMotion, ...]
 
@@ -102,6 +120,7 @@ def mobility(mechanism: MechanismData) -> Mobility:
     compounds = _compounds(mechanism)
     names = row_names(driven)
     undetermined = np.zeros(len(names))
+    free: list[tuple[FloatArray, FloatArray]] = []
     rates = np.zeros(nv)
     idle = [len(columns) for _, columns in compounds]
     for q in samples if names else ():
@@ -120,6 +139,8 @@ def mobility(mechanism: MechanismData) -> Mobility:
         dependent = null_basis(G.T, RANK)
         if len(G) - dependent.shape[1] == structure_of(driven).rank:
             np.maximum(undetermined, (dependent**2).sum(axis=1), out=undetermined)
+            free.append((q, dependent))
+    loaded = _carried_by_joints(driven, geometry, free)
     return Mobility(
         joint_freedoms=nv,
         rows=rows,
@@ -130,6 +151,12 @@ def mobility(mechanism: MechanismData) -> Mobility:
         redundant_rows=structure.redundant_rows,
         pivoted_redundancy=structure.pivoted_redundancy if rows else 0,
         indeterminate_rows=tuple(n for n, u in zip(names, undetermined) if u > DETERMINED),
+        indeterminate_joints=tuple(
+            f"{name}.{part}"
+            for name in mechanism.joint_names
+            for part, size in zip(COMPONENTS, loaded[mechanism.model.getJointId(name)])
+            if size > RANK
+        ),
         unreachable_joints=_unreachable(mechanism, rates) if rows else (),
         idle=tuple(
             IdleMotion(joints, count) for (joints, _), count in zip(compounds, idle) if count
@@ -137,6 +164,45 @@ def mobility(mechanism: MechanismData) -> Mobility:
         if rows
         else (),
     )
+
+
+def _carried_by_joints(
+    mechanism: MechanismData,
+    geometry: ClosureGeometry,
+    found: list[tuple[FloatArray, FloatArray]],
+) -> FloatArray:
+    """Largest components (njoints, 6) of the loads of the joints under multipliers that are in
+    equilibrium by themselves, over the largest of all joints.
+
+    ``found``: configurations with such multipliers, (rows, k) of the normalised rows.
+    """
+    model = mechanism.model
+    largest = np.zeros((model.njoints, 6))
+    if not any(dependent.size for _, dependent in found):
+        return largest
+    # Normalised rows are divided by their unit and their size, and so are their multipliers.
+    size = constraint_units(mechanism, geometry.units)
+    size[: len(geometry.row_size)] *= geometry.row_size
+    placed = Placements.at(model, workspace(model), np.array([q for q, _ in found]))
+    anchored = []
+    end = 0
+    for closure in (*mechanism.loops, *driven_closures(mechanism.drives)):
+        own = slice(end, end + closure.rows.count)
+        end = own.stop
+        if closure.anchors:
+            on_b = row_wrenches(closure, model, placed)
+            rows = about_origin(on_b, closure, model, placed)
+            anchored.append((own, bodies_of(closure, model), rows))
+    for k, (_, dependent) in enumerate(found):
+        multipliers = dependent / size[:, None]
+        loads = np.zeros((dependent.shape[1], model.njoints, 6))
+        for own, bodies, rows in anchored:
+            add_between(loads, bodies, multipliers[own].T @ rows[k])
+        whole = moved(sums_of_subtrees(model, loads), placed.origin[k])[:, 1:]
+        whole[..., 3:] /= geometry.units.length
+        sizes = np.linalg.norm(whole, axis=0)
+        np.maximum(largest[1:], sizes / (sizes.max() or 1.0), out=largest[1:])
+    return largest
 
 
 def _samples(mechanism: MechanismData) -> list[FloatArray]:

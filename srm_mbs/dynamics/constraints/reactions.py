@@ -1,14 +1,26 @@
-r"""Reaction forces and multipliers of the closures, and the forces of the drives.
+r"""Reactions of closures and joints, multipliers, and the forces of the drives.
 
 From yhat = M^{-1} G^T lam the multipliers follow as the solution of (L^{-1} G^T) lam = L^T yhat
 over all rows whose norm, in the scaled rows, is least.  Singular values beyond the rank of the
 solve hold the closure error only and are left out.  The wrench that a exerts on b is C^T lam with
 the rows C of the closure taken at b's origin.  A drive exerts -lam on its coordinate.
+
+The wrench that the parent link exerts on the child of a joint is, by the Newton-Euler equations of
+the bodies of the child's subtree S,
+
+    f_j = sum over i in S of (I_i a_i + v_i x* I_i v_i - f_i),
+
+with gravity as an acceleration in a_i, and f_i the wrenches of closures and of force elements
+between links on the body i.  What acts on the coordinates of a joint (controllers, drives, springs,
+damping, friction) acts between parent and child, and so is part of f_j; a rotor (armature) is no
+part of the child: its inertia takes its share of the force on the coordinate before the child.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Self
 
 import numpy as np
 import pinocchio as pin
@@ -16,57 +28,127 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import cholesky, whiten
-from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
-from srm_mbs.dynamics.constraints.rows import row_wrenches
+from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, driven_closures
+from srm_mbs.dynamics.constraints.wrenches import (
+    Placements,
+    about_origin,
+    add_between,
+    bodies_of,
+    moved,
+    row_wrenches,
+    sums_of_subtrees,
+)
+from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
+from srm_mbs.errors import KnownKeys
 from srm_mbs.model.drives import in_order_of_rows
 
+_System = OpenSystem | ClosedSystem
+BLOCK = 1024
+"""States that are computed at once, so that the placements of long runs do not fill the memory."""
 
-def reactions_at(
-    system: OpenSystem | ClosedSystem, t: FloatArray, q: FloatArray, v: FloatArray
-) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-    """Wrenches {loop: (n, 6)} and multipliers {loop: (n, rows)} at n states.
 
-    Wrenches are force (N) then moment (N m) that a exerts on b, at b's origin, in world axes.
-    Next to a singular configuration the multipliers grow without bound, as they do in the
-    mechanism.
+@dataclass(frozen=True, eq=False)
+class Reactions:
+    """Forces within a mechanism at n states.
+
+    Wrenches are force (N) then moment (N m) in world axes.  Next to a singular configuration
+    multipliers grow without bound, as they do in the mechanism, and with them all others.
+
+    Attributes
+    ----------
+    closures : {loop: (n, 6)}
+        Wrench that a exerts on b, at b's origin, of each closure between anchors.
+    multipliers : {loop: (n, rows)}
+        lam of each closure.
+    drives : {drive: (n,)}
+        Force (N) or torque (N m) on the driven coordinate in the positive sense.
+    joints : {joint: (n, 6)}
+        Wrench that the parent link exerts on the child, at the origin of the joint.
     """
-    mechanism = system.mechanism
+
+    closures: dict[str, FloatArray]
+    multipliers: dict[str, FloatArray]
+    drives: dict[str, FloatArray]
+    joints: dict[str, FloatArray]
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Those of the same mechanism at the states of all ``parts``, one after the other."""
+        tables = ([getattr(part, field.name) for part in parts] for field in fields(cls))
+        return cls(
+            *(
+                KnownKeys(
+                    (name, np.concatenate([own[name] for own in of_parts])) for name in of_parts[0]
+                )
+                for of_parts in tables
+            )
+        )
+
+
+def reactions_at(system: _System, t: FloatArray, q: FloatArray, v: FloatArray) -> Reactions:
+    """The reactions at n states q (n, nq), v (n, nv) at the times t (n,) s.
+
+    Raises
+    ------
+    EvaluationError, ControllerError
+        If the equations of motion cannot be evaluated at one of them.
+    """
+    blocks = [slice(i, i + BLOCK) for i in range(0, max(len(t), 1), BLOCK)]
+    return Reactions.joined([_block(system, t[own], q[own], v[own]) for own in blocks])
+
+
+def _block(system: _System, t: FloatArray, q: FloatArray, v: FloatArray) -> Reactions:
+    """:func:`reactions_at`, with all intermediate results in memory at once."""
+    mechanism, n = system.mechanism, len(t)
     model = mechanism.model
-    wrenches = {loop.name: np.zeros((len(t), 6)) for loop in mechanism.loops if loop.anchors}
-    multipliers = {loop.name: np.zeros((len(t), loop.rows.count)) for loop in mechanism.loops}
-    for i, lam, data in _multipliers(system, t, q, v):
-        at = 0
-        for loop in mechanism.loops:
-            own = lam[at : at + loop.rows.count]
-            at += loop.rows.count
-            multipliers[loop.name][i] = own
-            if loop.anchors:
-                wrenches[loop.name][i] = row_wrenches(loop, model, data).T @ own
-    return wrenches, multipliers
-
-
-def drive_forces_at(
-    system: OpenSystem | ClosedSystem, t: FloatArray, q: FloatArray, v: FloatArray
-) -> dict[str, FloatArray]:
-    """Force (N) or torque (N m) of each drive {name: (n,)} at n states, on its coordinate in the
-    positive sense."""
-    drives = system.mechanism.drives
-    forces = {drive.name: np.zeros(len(t)) for drive in drives}
-    ordered = in_order_of_rows(drives)
-    for i, lam, _ in _multipliers(system, t, q, v):
-        for drive, own in zip(ordered, lam[len(lam) - len(ordered) :]):
-            forces[drive.name][i] = -own
-    return forces
+    ordered = in_order_of_rows(mechanism.drives)
+    closures = [*mechanism.loops, *driven_closures(mechanism.drives)]
+    lam = np.zeros((n, sum(closure.rows.count for closure in closures)))
+    inertial, loads = np.zeros((2, n, model.njoints, 6))
+    placed = Placements.empty(model, n)
+    data, forces = workspace(model), resolved_forces(mechanism)
+    for i, own, a in _multipliers(system, t, q, v):
+        if own is not None:
+            lam[i] = own
+        pin.forwardKinematics(model, data, q[i], v[i])
+        placed.take(i, data)
+        if forces is not None:
+            for one, other, wrench in forces.between_links(data, q[i], v[i], t[i]):
+                loads[i, one] += wrench
+                loads[i, other] -= wrench
+        pin.rnea(model, data, q[i], v[i], a)
+        for j, force in enumerate(data.f):
+            inertial[i, j] = force.vector
+    ends = np.cumsum([closure.rows.count for closure in closures], dtype=int)
+    multipliers = [lam[:, end - c.rows.count : end] for c, end in zip(closures, ends.tolist())]
+    wrenches = [
+        np.einsum("nrk,nr->nk", row_wrenches(closure, model, placed), own)
+        if closure.anchors
+        else None
+        for closure, own in zip(closures, multipliers)
+    ]
+    for closure, at_b in zip(closures, wrenches):
+        if at_b is not None:
+            on_b = about_origin(at_b, closure, model, placed)
+            add_between(loads, bodies_of(closure, model), on_b)
+    halves = inertial.reshape(n, model.njoints, 2, 3, 1)
+    turned = (placed.rotation[:, :, None] @ halves).reshape(inertial.shape)
+    joints = turned - moved(sums_of_subtrees(model, loads), placed.origin)
+    driven = zip(ordered, multipliers[len(mechanism.loops) :])
+    return Reactions(
+        KnownKeys((c.name, w) for c, w in zip(mechanism.loops, wrenches) if w is not None),
+        KnownKeys((c.name, own) for c, own in zip(mechanism.loops, multipliers)),
+        KnownKeys((drive.name, -own[:, 0]) for drive, own in driven),
+        KnownKeys((name, joints[:, model.getJointId(name)]) for name in mechanism.joint_names),
+    )
 
 
 def _multipliers(
-    system: OpenSystem | ClosedSystem, t: FloatArray, q: FloatArray, v: FloatArray
-) -> Iterator[tuple[int, FloatArray, pin.Data]]:
-    """Number of the state, lam (rows,) of all rows, unscaled, and data with the placements; nothing
-    for a mechanism without closures."""
-    if not system.has_constraints:
-        return
+    system: _System, t: FloatArray, q: FloatArray, v: FloatArray
+) -> Iterator[tuple[int, FloatArray | None, FloatArray]]:
+    """Number of the state, lam (rows,) of all rows, unscaled, None for a mechanism without
+    effective closures, and the acceleration v' (nv,)."""
     mechanism = system.mechanism
     model = mechanism.model
     rows = DrivenKinematics(model, mechanism.loops, mechanism.drives)
@@ -74,10 +156,15 @@ def _multipliers(
     data = workspace(model)
     for i in range(len(t)):
         terms = system.evaluate(t[i], np.concatenate([q[i], v[i]]))
+        acceleration = terms.rate()[model.nv :].copy()
+        if not system.has_constraints:
+            yield i, None, acceleration
+            continue
         yhat = terms.multiplier().copy()
         rows.evaluate(model, data, q[i])
         U = cholesky(data.M)
         W = whiten(U, (rows.G / scale[:, None]).T)
         left, singular, right = np.linalg.svd(W, full_matrices=False)
         k = terms.rank
-        yield i, ((left[:, :k].T @ (U @ yhat)) / singular[:k]) @ right[:k] / scale, data
+        lam = ((left[:, :k].T @ (U @ yhat)) / singular[:k]) @ right[:k] / scale
+        yield i, lam, acceleration

@@ -51,7 +51,7 @@ GRAPH_ORDER_ABOVE = 64
 KERNEL_ABOVE = 64
 """Coordinates above which row algebra runs on the compiled kernel, where there is one."""
 
-ARPACK_ABOVE = 64
+SPARSE_ABOVE = 64
 """Columns above which singular values come from a sparse factorisation."""
 
 LARGEST_FILL = 0.5
@@ -295,6 +295,14 @@ class CompiledAlgebra:
         """Orthonormal basis (nv, nv - rank) of L^T x over the null space x of the rows in use."""
         return self._algebra.complement().T  # type: ignore[no-any-return]
 
+    def smallest(self, G: FloatArray, cut: float) -> tuple[int, float]:
+        """Rank of G, with pivots below ``cut`` as zero, and its smallest singular value, 0 if rows
+        depend on each other; in one call, so that threads may share the algebra."""
+        try:
+            return self._algebra.weakest(np.ascontiguousarray(G), cut)  # type: ignore[no-any-return]
+        except ArithmeticError:
+            raise EvaluationError("the closures are not finite") from None
+
 
 def row_algebra(pattern: BoolArray, model: pin.Model | None = None) -> RowAlgebra:
     """The algebra of rows with entries where ``pattern`` (rows, nv) is true: by the kernel for
@@ -387,49 +395,67 @@ def min_norm_solution(A: FloatArray, b: FloatArray, rcond: float) -> FloatArray:
 
 def smallest_singular_value(A: FloatArray, zero: float) -> float:
     """The smallest singular value of A (m, n) above ``zero``; infinite if there is none."""
-    found = _weakest_pivoted(A, zero)
+    found = SingularValues(A != 0.0).smallest(A, zero)
     if found is not None:
         return found[1]
     size = np.linalg.svd(A, compute_uv=False)
     return float(size[size > zero].min(initial=np.inf))
 
 
+class SingularValues:
+    """Singular values of matrices whose entries lie in the same places; keeps what follows from
+    them.  Threads may share it.
+
+    Parameters
+    ----------
+    pattern : (rows, columns)
+        Which entries may differ from zero.
+    """
+
+    def __init__(self, pattern: BoolArray) -> None:
+        self._pattern = pattern
+        self._algebras: dict[bytes, RowAlgebra] = {}
+
+    def __call__(self, matrices: FloatArray, k: int) -> FloatArray:
+        """The k-th largest singular values (n,), k from 1, of ``matrices`` (n, rows, columns)."""
+        if matrices.shape[2] > SPARSE_ABOVE:
+            return np.array([self._of_one(A, k) for A in matrices])
+        return np.asarray(np.linalg.svd(matrices, compute_uv=False)[:, k - 1], dtype=np.float64)
+
+    def smallest(self, A: FloatArray, zero: float) -> tuple[int, float] | None:
+        """Rank of A (rows, columns) and its smallest singular value, by a sparse factorisation of
+        the rows that are not zero; None if there is no kernel, or A has few columns, or where these
+        rows depend on each other: the rows in use have other singular values."""
+        if A.shape[1] <= SPARSE_ABOVE:
+            return None
+        active = np.sqrt((A * A).sum(axis=1)) > INERT
+        key = active.tobytes()
+        if key not in self._algebras:
+            self._algebras[key] = row_algebra(self._pattern[active])
+        algebra = self._algebras[key]
+        if not isinstance(algebra, CompiledAlgebra):
+            return None
+        rank, value = algebra.smallest(A[active], zero)
+        return (rank, value) if 0 < rank == np.count_nonzero(active) else None
+
+    def _of_one(self, A: FloatArray, k: int) -> float:
+        found = self.smallest(A, PIVOT_ZERO)
+        if found is not None and found[0] == k:
+            return found[1]
+        return float(np.linalg.svd(A, compute_uv=False)[k - 1])
+
+
 def singular_value(A: FloatArray, k: int) -> float:
     """The k-th largest singular value of A (m, n), k from 1."""
-    found = _weakest_pivoted(A, PIVOT_ZERO)
-    if found is not None and found[0] == k:
-        return found[1]
-    return float(np.linalg.svd(A, compute_uv=False)[k - 1])
+    return float(SingularValues(A != 0.0)(A[None], k)[0])
 
 
 def _pivoted(A: FloatArray, cut: float) -> CompiledAlgebra | None:
     """The factorisation of A by the kernel, if it is there and A has many columns."""
-    if A.shape[1] <= ARPACK_ABOVE:
+    if A.shape[1] <= SPARSE_ABOVE:
         return None
     algebra = row_algebra(A != 0.0)
     if not isinstance(algebra, CompiledAlgebra):
         return None
     algebra.factor(None, A, cut)
     return algebra
-
-
-def _weakest_pivoted(A: FloatArray, zero: float) -> tuple[int, float] | None:
-    """Rank and weakest singular value, by the factorisation of the rows that are not zero; None
-    where these depend on each other: the rows in use have other singular values."""
-    rows = A[np.sqrt((A * A).sum(axis=1)) > INERT]
-    algebra = _pivoted(rows, zero)
-    if algebra is None or not 0 < algebra.rank == len(rows):
-        return None
-    from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
-
-    n = A.shape[1]
-    # A^+ A^+T has the largest eigenvalue 1 / weakest^2.
-    inverse = LinearOperator(
-        (n, n), matvec=lambda x: algebra.solve(algebra.multiplier(np.ravel(x))), dtype=float
-    )
-    start = np.random.default_rng(0).standard_normal(n)
-    try:
-        values = eigsh(inverse, 1, which="LM", v0=start, return_eigenvectors=False)
-    except ArpackError:
-        return None
-    return algebra.rank, float(1.0 / np.sqrt(values[0]))

@@ -13,8 +13,9 @@ m = R u, have
     G  = d^T X_lin (J_a - J_b),             Gdot v = d . (B_lin + w x r) + |d x r|^2/|p|,
     G  = (m x n)^T X_ang (J_a - J_b),       Gdot v = n . (B_ang x m + w x (w x m)),
 
-with X = H^{-1} as a 6 x 6 matrix and J the world-frame joint Jacobian.  A joint row, the linear
-relation g = sum c_i q_i - s of joint coordinates, has constant entries c_i in G, and Gdot v = 0.
+with X = H^{-1} as a 6 x 6 matrix and J the world-frame joint Jacobian.  A joint row, the relation
+g = sum c_i q_i - s - P(y) of joint coordinates with y = sum b_i q_i, has the entries
+c_i - P'(y) b_i in G, and Gdot v = -P''(y) (sum b_i v_i)^2; without P they are constant and 0.
 
 Vectors of three numbers are plain floats here, because NumPy's overhead is many times the cost of
 their products.  They are in the axes of the joint that carries b (the world's for a closure to the
@@ -27,7 +28,7 @@ body that is at x.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from typing import Any, NamedTuple, Self
 
@@ -100,10 +101,31 @@ class _JointTerm(NamedTuple):
     in_v: int
     continuous: bool
     """Whether q is an angle that is stored as (cos, sin)."""
+    argument: float
+    """b, of the argument y of the powers."""
+
+
+class _ScaledJointRow(NamedTuple):
+    """A joint row over its scale."""
+
+    terms: list[_JointTerm]
+    offset: float
+    powers: list[float]
+    """a_2, a_3, ... of P(y); empty in a linear row."""
 
 
 class _JointRows:
-    """The kept, scaled joint rows of one closure; their Jacobian ``G`` (count, nv) is constant."""
+    """The kept, scaled joint rows of one closure.
+
+    Attributes
+    ----------
+    pattern : (count, nv) bool
+        Which entries of their Jacobian may differ from zero.
+    is_constant
+        Whether all rows are linear.
+    G : (count, nv)
+        Their Jacobian, constant or after :meth:`evaluate`.
+    """
 
     def __init__(
         self, model: pin.Model, loop: LoopClosure, scale: FloatArray, keep: BoolArray, start: int
@@ -112,42 +134,72 @@ class _JointRows:
         self.first_row, self.count = start, len(kept)
         self.support = np.zeros(model.nv)  # the world Jacobian has no part in them
         self.G = np.zeros((self.count, model.nv))
-        # The terms of each row, and its offset, over the row scale.
-        self._rows: list[tuple[list[_JointTerm], float]] = []
-        for own, (row, factor) in zip(self.G, kept):
+        self.pattern = np.zeros(self.G.shape, dtype=bool)
+        self._rows: list[_ScaledJointRow] = []
+        for own, used, (row, factor) in zip(self.G, self.pattern, kept):
             terms = []
-            for c, name in zip(row.coefficients, row.joints):
+            arguments = row.arguments or (0.0,) * len(row.joints)
+            for c, b, name in zip(row.coefficients, arguments, row.joints):
                 joint = model.joints[model.getJointId(name)]
-                terms.append(_JointTerm(factor * c, joint.idx_q, joint.idx_v, joint.nq == 2))
+                terms.append(_JointTerm(factor * c, joint.idx_q, joint.idx_v, joint.nq == 2, b))
                 own[joint.idx_v] = factor * c
-            self._rows.append((terms, factor * row.offset))
+                used[joint.idx_v] = c != 0.0 or b != 0.0
+            powers = [factor * a for a in row.powers]
+            self._rows.append(_ScaledJointRow(terms, factor * row.offset, powers))
+        self.is_constant = not any(row.powers for row in self._rows)
+
+    def copy_workspace(self) -> _JointRows:
+        """The same rows with memory of their own."""
+        other = copy(self)
+        other.G = self.G.copy()
+        return other
 
     def constants(self) -> list[dict[str, Any]]:
         """Constants of each row for the compiled kernel."""
         return [
             {
-                "row": row,
-                "coefficients": np.array([term.coefficient for term in terms]),
-                "in_q": [term.in_q for term in terms],
-                "in_v": [term.in_v for term in terms],
-                "offset": offset,
+                "row": number,
+                "coefficients": np.array([term.coefficient for term in row.terms]),
+                "in_q": [term.in_q for term in row.terms],
+                "in_v": [term.in_v for term in row.terms],
+                "offset": row.offset,
+                "arguments": np.array([term.argument for term in row.terms if row.powers]),
+                "powers": np.array(row.powers),
             }
-            for row, (terms, offset) in enumerate(self._rows, self.first_row)
+            for number, row in enumerate(self._rows, self.first_row)
         ]
 
     def bind(self, data: pin.Data) -> None:
-        """Do nothing: joint rows depend on q alone."""
+        """Do nothing: joint rows depend on q and v alone."""
 
-    def evaluate(self, q: FloatArray, with_bias: bool, out: list[float]) -> None:
-        """Append for each row six zeros for G, which is constant, then g, then Gdot v = 0.
+    def evaluate(self, q: FloatArray, v: FloatArray | None, out: list[float]) -> None:
+        """Append for each row six zeros for G, which no wrenches give, then g, then Gdot v.
 
         Angles that are stored as (cos, sin), of which drives have rows, are in [-pi, pi].
         """
-        for terms, offset in self._rows:
-            g = -offset
-            for c, k, _, continuous in terms:
+        for own, (terms, offset, powers) in zip(self.G, self._rows):
+            g, bias = -offset, 0.0
+            for c, k, _, continuous, _ in terms:
                 g += c * (math.atan2(q[k + 1], q[k]) if continuous else q[k])
-            out += 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, g, 0.0
+            if powers:
+                y = sum(term.argument * q[term.in_q] for term in terms)
+                value, slope, curvature = _powers(powers, y)
+                g -= value
+                for term in terms:
+                    own[term.in_v] = term.coefficient - slope * term.argument
+                if v is not None:
+                    bias = -curvature * sum(term.argument * v[term.in_v] for term in terms) ** 2
+            out += 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, g, bias
+
+
+def _powers(powers: Sequence[float], y: float) -> Triple:
+    """P, P' and P'' of P(y) = sum a_k y^k, ``powers`` = a_2, a_3, ..., by Horner's scheme."""
+    value = slope = half_curvature = 0.0
+    for a in (*reversed(powers), 0.0, 0.0):
+        half_curvature = half_curvature * y + slope
+        slope = slope * y + value
+        value = value * y + a
+    return value, slope, 2.0 * half_curvature
 
 
 COINCIDENT = 1e-9
@@ -245,8 +297,13 @@ class _LoopRows:
         """Read the bodies of ``data`` from now on."""
         self._a, self._b = _Body(data, self.joint_a), _Body(data, self.joint_b)
 
-    def evaluate(self, q: FloatArray, with_bias: bool, out: list[float]) -> None:
+    def copy_workspace(self) -> _LoopRows:
+        """The same rows, to be bound to other data."""
+        return copy(self)
+
+    def evaluate(self, q: FloatArray, v: FloatArray | None, out: list[float]) -> None:
         """Append for each row (force, moment) of G = (force, moment) J, then g, then Gdot v."""
+        with_bias = v is not None  # the data have the velocities
         if self._d or self._distances:
             self._positions(with_bias, out)
         if self._un:
@@ -366,7 +423,6 @@ class LoopKinematics:
         mask = np.ones(total, dtype=bool) if keep is None else np.asarray(keep, dtype=bool)
         self._loops: list[_LoopRows | _JointRows] = []
         supports = [np.zeros((0, model.nv))]
-        self._constant: list[tuple[slice, FloatArray]] = []
         self._anchored = 0
         at = m = 0
         for loop in loops:
@@ -378,11 +434,8 @@ class LoopKinematics:
                 continue
             self._loops.append(resolved)
             supports.append(np.tile(resolved.support, (resolved.count, 1)))
-            own = slice(m, m + resolved.count)
-            m = own.stop
-            if isinstance(resolved, _JointRows):
-                self._constant.append((own, resolved.G))
-            else:
+            m += resolved.count
+            if isinstance(resolved, _LoopRows):
                 self._anchored = m
         self._support = np.concatenate(supports)
         place = (np.cumsum(mask) - 1).tolist()
@@ -405,20 +458,24 @@ class LoopKinematics:
     def copy_workspace(self) -> Self:
         """The same rows with memory of their own: anchors are not looked up again."""
         other = copy(self)
-        other._loops = [copy(loop) for loop in self._loops]
+        other._loops = [loop.copy_workspace() for loop in self._loops]
         other._allocate()
         return other
 
     @property
     def is_constant(self) -> bool:
-        """Whether G is constant: all rows are those of joint coordinates."""
-        return not self._anchored
+        """Whether G is constant: all rows are linear relations of joint coordinates."""
+        return not self._anchored and all(rows.is_constant for rows in self._joint_rows)
+
+    @property
+    def _joint_rows(self) -> Iterator[_JointRows]:
+        return (rows for rows in self._loops if isinstance(rows, _JointRows))
 
     def pattern(self) -> BoolArray:
         """Which entries of G (m, nv) may differ from zero."""
         out: BoolArray = self._support != 0.0
-        for own, entries in self._constant:
-            out[own] = entries != 0.0
+        for rows in self._joint_rows:
+            out[rows.first_row : rows.first_row + rows.count] = rows.pattern
         return out
 
     def constants(self) -> dict[str, Any]:
@@ -426,20 +483,15 @@ class LoopKinematics:
         ``eliminations``."""
         return {
             "loops": [loop.constants() for loop in self._loops if isinstance(loop, _LoopRows)],
-            "joint_rows": [
-                row
-                for rows in self._loops
-                if isinstance(rows, _JointRows)
-                for row in rows.constants()
-            ],
+            "joint_rows": [row for rows in self._joint_rows for row in rows.constants()],
             "eliminations": [
                 (e.row, e.other, e.factor, np.flatnonzero(self._support[e.row]).tolist())
                 for e in self._eliminations
             ],
         }
 
-    def update(self, data: pin.Data, q: FloatArray, with_bias: bool = True) -> None:
-        """Evaluate g and G, and Gdot v unless ``with_bias`` is false, at the configuration q (nq,).
+    def update(self, data: pin.Data, q: FloatArray, v: FloatArray | None = None) -> None:
+        """Evaluate g and G at the configuration q (nq,), and Gdot v if the rates v (nv,) are given.
 
         ``data`` must hold crba in the WORLD convention (placements, world Jacobian) and, for the
         bias, nonLinearEffects (velocities, bias accelerations) at the current state.
@@ -455,13 +507,13 @@ class LoopKinematics:
                 loop.bind(data)
         numbers: list[float] = []
         for loop in self._loops:
-            loop.evaluate(q, with_bias, numbers)
+            loop.evaluate(q, v, numbers)
         self._numbers[:] = numbers
         G, anchored = self.G, slice(self._anchored)
         np.dot(self._wrenches[anchored], self._J, G[anchored])
         np.multiply(G, self._support, G)
-        for own, entries in self._constant:
-            G[own] = entries
+        for rows in self._joint_rows:
+            G[rows.first_row : rows.first_row + rows.count] = rows.G
         for row, other, factor in self._eliminations:
             for each in (G, self.g, self.bias):
                 each[row] -= factor * each[other]
@@ -474,7 +526,7 @@ class LoopKinematics:
         pin.crba(model, data, q, pin.Convention.WORLD)
         if v is not None:
             pin.nonLinearEffects(model, data, q, v)
-        self.update(data, q, with_bias=v is not None)
+        self.update(data, q, v)
 
     def move_to(self, t: float) -> None:
         """Do nothing: the rows of loops do not depend on the time t (s)."""
@@ -498,23 +550,3 @@ def closure_errors(
     """g (n, rows) in m and rad, and G v (n, rows), of all rows at n states q (n, nq), v (n, nv)."""
     rows = LoopKinematics(model, loops)
     return rows.errors(model, workspace(model), np.zeros(len(q)), q, v)
-
-
-def row_wrenches(loop: LoopClosure, model: pin.Model, data: pin.Data) -> FloatArray:
-    """Wrench on b, at b's origin in world axes, per unit multiplier of each row: (rows, 6).
-
-    For closures between anchors.  ``data`` must hold the joint placements.  Force (3) then moment
-    (3); a's body feels the opposite wrench at the same point.
-    """
-    Ta, Tb = (data.oMi[joint] * inside for joint, inside in loop.resolve(model))
-    gap = Ta.translation - Tb.translation
-    out = []
-    for d in loop.rows.directions:
-        force = Tb.rotation @ d
-        out.append(np.concatenate([force, cross(gap, force)]))
-    if loop.rows.distances:  # along the line through both origins
-        out.append(np.concatenate([gap / np.linalg.norm(gap), np.zeros(3)]))
-    for u, n in loop.rows.alignments:
-        moment = cross(Ta.rotation @ u, Tb.rotation @ n)
-        out.append(np.concatenate([np.zeros(3), moment]))
-    return np.array(out)

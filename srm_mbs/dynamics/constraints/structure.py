@@ -195,7 +195,7 @@ class ManifoldSampler:
                 if mean <= ROUNDING_ROW**2 * whole:
                     mean = whole  # always satisfied: keep rounding from being scaled up to a row
                 scale[block] = np.sqrt(mean) if mean > 0.0 else 1.0
-            scale[joints] = np.sqrt(own[joints])  # constant entries: nothing cancels
+            scale[joints] = np.sqrt(own[joints])  # no kinematics in them: no rounding
             at += loop.rows.count
         driven = squares[at:]
         self.scale[at:] = np.sqrt(np.where(driven > 0.0, driven, 1.0))

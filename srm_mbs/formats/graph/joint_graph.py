@@ -30,11 +30,12 @@ FREEDOM = {
     "revolute": 1,
     "prismatic": 1,
     "screw": 1,
+    "slot": 2,
     "universal": 2,
     "spherical": 3,
     "floating": 6,
 }
-"""Degrees of freedom of the types of joint."""
+"""Degrees of freedom of the types of joint; a slot is a pin that slides along a line."""
 ROOT_JOINT = "root_joint"
 """Pinocchio's name for the joint of a floating or planar base."""
 

@@ -6,8 +6,10 @@ refused.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -27,17 +29,18 @@ SECTIONS = words(
 )
 """Sections that are read, or looked into."""
 IGNORED_SECTIONS = words("size visual statistic sensor custom extension")
-BODY_READ = words("inertial joint freejoint geom site body frame replicate")
+BODY_READ = words("inertial joint freejoint geom site body frame replicate attach")
 BODY_IGNORED = ("camera", "light")
 PLACED = "pos quat axisangle xyaxes zaxis euler"
 ATTRIBUTES = _table(
     {
         "compiler": """angle eulerseq coordinate autolimits inertiafromgeom inertiagrouprange
-            boundmass boundinertia balanceinertia settotalmass meshdir assetdir""",
+            boundmass boundinertia balanceinertia settotalmass meshdir assetdir conflict""",
         "option": "gravity wind density viscosity",
         "body": f"name childclass mocap gravcomp {PLACED}",
         "frame": f"name childclass {PLACED}",
         "replicate": "count sep offset euler",
+        "attach": "model body prefix",
         "inertial": f"mass diaginertia fullinertia {PLACED}",
         "joint": """name class type pos axis springdamper stiffness range limited ref springref
             armature damping frictionloss actuatorgravcomp""",
@@ -52,6 +55,7 @@ ATTRIBUTES = _table(
         "spatial": "name class stiffness damping frictionloss springlength armature",
         "mesh": "name class file scale inertia refpos refquat",
         "material": "name class rgba",
+        "model": "name file",
         "key": "name qpos qvel",
     }
 )
@@ -62,12 +66,13 @@ CONTACT = "solref solimp margin gap user"
 IGNORED_ATTRIBUTES = _table(
     {
         "compiler": """strippath texturedir discardvisual usethread fusestatic alignfree convexhull
-            conflict exactmeshinertia saveinertial""",
+            exactmeshinertia saveinertial""",
         "option": """timestep apirate impratio tolerance ls_tolerance noslip_tolerance ccd_tolerance
             mpr_tolerance magnetic o_margin o_solref o_solimp o_friction integrator cone jacobian
             solver iterations ls_iterations noslip_iterations ccd_iterations mpr_iterations
             sdf_iterations sdf_initpoints actuatorgroupdisable collision sleep_tolerance""",
         "body": "user sleep",
+        "model": "content_type",
         "joint": """group user margin solreflimit solimplimit solreffriction solimpfriction
             actuatorfrcrange actuatorfrclimited""",
         "freejoint": "group align",
@@ -114,19 +119,54 @@ class Compiler:
     total_mass: float = -1.0
     groups: tuple[int, int] = (0, 5)
     mesh_folder: str = ""
+    merges: bool = False
+    """Whether the options of attached models act where those of the main file are the defaults."""
 
 
 class MjcfValues(XmlValues):
     """Values of one file, with its compiler settings and default classes.
 
-    ``off`` has the kinds of force that ``<flag>`` disables.
+    Parameters
+    ----------
+    file
+        Its name.
+    prefix
+        Of its names, if it is attached.
+    main
+        The values of the main file, if it is another one; notes and counts are kept together.
+
+    Attributes
+    ----------
+    off
+        The kinds of force that ``<flag>`` of the main file disables.
     """
 
-    def __init__(self, file: str) -> None:
-        super().__init__(file)
+    def __init__(self, file: str, prefix: str = "", main: MjcfValues | None = None) -> None:
+        super().__init__(file, main)
+        self.prefix, self.main = prefix, self if main is None else main
         self.compiler = Compiler()
         self.classes: dict[str, dict[str, dict[str, str]]] = {MAIN: {}}
-        self.off: set[str] = set()
+        self.off: set[str] = set() if main is None else main.off
+        self._attached = 0
+
+    @property
+    def folder(self) -> Path:
+        """Where the main file lies; the model is written as if it was in one file there."""
+        return Path(self.main.file).parent
+
+    def relative(self, path: Path) -> Path:
+        """``path``, which is relative to this file, relative to the main one."""
+        if self.main is self or path.is_absolute():
+            return path
+        return Path(os.path.relpath(Path(self.file).parent / path, self.folder))
+
+    def count_attached(self, count: int, where: str, most: int) -> None:
+        """Count elements that are attached, and refuse more than ``most``."""
+        self.main._attached += count
+        if self.main._attached > most:
+            raise self.fault(
+                where, f"more than {most} elements are attached", "Use smaller models, or fewer"
+            )
 
     def read_defaults(self, node: Element, parent: str | None = None) -> None:
         """Read a ``<default>`` and those inside it."""

@@ -21,6 +21,7 @@ from srm_mbs.formats.graph.joint_graph import FREEDOM, Body, Joint, inertia_at
 from srm_mbs.formats.graph.spanning_tree_to_urdf import anchor
 from srm_mbs.formats.mjcf.attributes import BODY_IGNORED, BODY_READ, Attributes, MjcfValues
 from srm_mbs.formats.mjcf.geoms import Geom, Mesh, inertia_of, read_geom, visuals_of
+from srm_mbs.formats.mjcf.parts import Part, attached_part
 from srm_mbs.model.anchors import WORLD
 from srm_mbs.model.forces import OPEN_LIMIT
 from srm_mbs.model.reach import Reach
@@ -33,7 +34,6 @@ hundred bodies, which load in two seconds."""
 REFUSED = {
     "flexcomp": "a deformable body",
     "composite": "a chain or net of bodies",
-    "attach": "a part of another model",
 }
 """Elements of a body that are refused, and what they are."""
 FLAGS = {"stiffness": "spring", "damping": "damper", "friction": "frictionloss"}
@@ -51,7 +51,7 @@ URDF_TYPES = {"hinge": "revolute", "slide": "prismatic", "ball": "spherical"}
 
 
 class BodyReader:
-    """Collects bodies, joints and sites of one file.
+    """Collects bodies, joints and sites of one file, and of those that are attached to it.
 
     Attributes
     ----------
@@ -73,10 +73,15 @@ class BodyReader:
         Armatures of free joints by body.
     compensated
         Part of the weight that does not act (``gravcomp``), by body.
+    parts
+        The files: the main one first.
     """
 
-    def __init__(self, values: MjcfValues, reach: Reach) -> None:
-        self.values, self.reach = values, reach
+    def __init__(self, part: Part, reach: Reach) -> None:
+        self.reach = reach
+        self.parts = [part]
+        self._part, self._depth = part, 0
+        self._total_mass = part.values.compiler.total_mass
         self.bodies: dict[str, Body] = {}
         self.placements: dict[str, pin.SE3] = {WORLD: pin.SE3.Identity()}
         self.joints: list[Joint] = []
@@ -88,12 +93,17 @@ class BodyReader:
         self.references: dict[str, float] = {}
         self.rests: dict[str, float] = {}
         self.compensated: dict[str, float] = {}
-        self.meshes: dict[str, Mesh] = {}
-        self.colours: dict[str, str] = {}
+        self.meshes: dict[str, Mesh] = dict(part.meshes)
+        self.colours: dict[str, str] = dict(part.colours)
         self._names: set[str] = set()
         self._moving: set[str] = set()
         self._replicated = 0
         self._timed: dict[str, tuple[float, float]] = {}
+
+    @property
+    def values(self) -> MjcfValues:
+        """Those of the file that is being read, at the end the main one."""
+        return self._part.values
 
     def world(self, node: Element) -> None:
         """Read a ``<worldbody>``."""
@@ -141,7 +151,7 @@ class BodyReader:
         for tag, what in REFUSED.items():
             if node.find(tag) is not None:
                 raise values.fault(where, f"<{tag}> ({what}) is not read", "Remove it")
-        many = ("geom", "site", "body", "frame", "joint", "replicate")
+        many = ("geom", "site", "body", "frame", "joint", "replicate", "attach")
         values.children(node, where, BODY_READ, BODY_IGNORED, many)
         for child in node:
             match child.tag:
@@ -163,11 +173,49 @@ class BodyReader:
                         )
                     inside = given.text("childclass", childclass)
                     self._contents(child, name, around * given.placement(), inside, found)
+                case "attach":
+                    self._attach(child, name, around, found)
                 case "replicate":
                     for copied, place in self._replicas(child, where):
                         self._contents(copied, name, around * place, childclass, found)
                 case "joint" | "freejoint" if name == WORLD:
                     raise values.fault("<worldbody>", "the world has no joints", "Put it in a body")
+
+    def _attach(
+        self, node: Element, name: str, around: pin.SE3, found: dict[str, list[Any]]
+    ) -> None:
+        """Read an ``<attach>``: a body of another file, or all that is in its world."""
+        given = self.values.own(node, f"body {name!r}, <attach> {node.get('model', '')!r}")
+        outer, part = self._part, attached_part(self._part, given, self.reach, self._depth)
+        self.parts.append(part)
+        self.meshes |= part.meshes
+        self.colours |= part.colours
+        wanted, first = given.text("body"), len(self.order)
+        contents = part.contents()
+        self._part, self._depth = part, self._depth + 1
+        if not wanted:
+            taken = Element("frame")
+            taken.extend(contents)
+            self._contents(taken, name, around, "", found)
+        elif wanted == WORLD:
+            taken = Element("body", name=part.values.prefix + WORLD)
+            taken.extend(contents)
+            self.body(taken, name, around, "")
+        else:
+            match part.body(part.values.prefix + wanted):
+                case taken, childclass:
+                    self.body(taken, name, around, childclass)
+                case _:
+                    raise given.fault(f"the model has no body {wanted!r}", "Name one of its bodies")
+        self._part, self._depth = outer, self._depth - 1
+        part.joints = slice(first, len(self.order))
+        inside = set(taken.iter())
+        part.left_out = {
+            inner.get("name", "")
+            for outside in contents
+            for inner in outside.iter()
+            if inner not in inside and inner.tag in ("body", "joint", "freejoint", "site")
+        } - {""}
 
     def _replicas(self, node: Element, where: str) -> Iterator[tuple[Element, pin.SE3]]:
         """The copies of a ``<replicate>``, whose names end with their numbers, and the placement of
@@ -184,6 +232,8 @@ class BodyReader:
             )
         if node.find("joint") is not None or node.find("freejoint") is not None:
             raise given.fault("a joint inside a <replicate> is not read", "Put it into a body")
+        if next(node.iter("attach"), None) is not None:
+            raise given.fault("<attach> inside a <replicate> is not read", "Write each by itself")
         angles = given.numbers("euler", 3, "0 0 0")
         offset, place = given.numbers("offset", 3, "0 0 0"), pin.SE3.Identity()
         for k in range(count):
@@ -216,7 +266,7 @@ class BodyReader:
         compiler = self.values.compiler
         where = f"body {name!r}"
         visuals = [v for geom in geoms for v in visuals_of(geom, self.meshes, self.colours)]
-        if name not in self._moving and compiler.total_mass <= 0.0:
+        if name not in self._moving and self._total_mass <= 0.0:
             return Body(name, None, tuple(visuals))
         inertia: pin.Inertia | None = None
         if len(inertials) > 1:
@@ -263,7 +313,7 @@ class BodyReader:
 
     def rescale(self) -> None:
         """Scale all inertias so that the total mass is ``settotalmass``."""
-        wanted = self.values.compiler.total_mass
+        wanted = self._total_mass
         total = sum(body.inertia.mass for body in self.bodies.values() if body.inertia is not None)
         if wanted <= 0.0 or total <= 0.0:
             return

@@ -13,15 +13,16 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs._typing import FloatArray
 from srm_mbs.formats.graph.spanning_tree_to_urdf import anchor
 from srm_mbs.formats.mjcf.attributes import (
     JOINT_EQUALITY,
     MAIN,
     TENDON_EQUALITY,
     Attributes,
-    MjcfValues,
 )
 from srm_mbs.formats.mjcf.bodies import BodyReader
+from srm_mbs.formats.mjcf.parts import Part
 from srm_mbs.model.anchors import WORLD
 
 KINDS = ("connect", "weld", "joint", "tendon")
@@ -40,7 +41,7 @@ Placed = tuple[str, pin.SE3]
 
 
 class EqualityReader:
-    """Reads ``<equality>`` and ``<tendon>`` when all bodies are known.
+    """Reads ``<equality>`` and ``<tendon>`` of the files when all bodies are known.
 
     Attributes
     ----------
@@ -48,21 +49,28 @@ class EqualityReader:
         Entries ``loop``, ``force``, ``lock`` and ``initial.q`` of a description.
     """
 
-    def __init__(self, values: MjcfValues, tree: BodyReader, sections: Sequence[Element]) -> None:
-        self.values, self.tree = values, tree
-        self._tendons: list[tuple[str, Element]] = []
+    def __init__(self, tree: BodyReader) -> None:
+        self.values, self.tree = tree.values, tree
         self._fixed_tendons: dict[str, Element] = {}
-        for section in sections:
-            values.children(section, "<tendon>", ("spatial", "fixed"), (), ("spatial", "fixed"))
-            for i, node in enumerate(section):
-                name = node.get("name") or f"{node.tag}_tendon_{i + 1}"
-                self._tendons.append((name, node))
-                if node.tag == "fixed":
-                    self._fixed_tendons[name] = node
         self.loops: list[dict[str, Any]] = []
         self.forces: list[dict[str, Any]] = []
         self.lock: list[str] = []
         self.held: dict[str, float] = {}
+
+    def read(self, part: Part) -> None:
+        """Read the constraints and tendons of a file."""
+        self.values = values = part.values
+        tendons: list[tuple[str, Element]] = []
+        for section in part.attached("tendon"):
+            values.children(section, "<tendon>", ("spatial", "fixed"), (), ("spatial", "fixed"))
+            for i, node in enumerate(section):
+                name = node.get("name") or f"{values.prefix}{node.tag}_tendon_{i + 1}"
+                tendons.append((name, node))
+                if node.tag == "fixed":
+                    self._fixed_tendons[name] = node
+        for section in part.attached("equality"):
+            self.equality(section)
+        self._springs(tendons)
 
     # Equality -------------------------------------------------------------------------------
 
@@ -78,7 +86,8 @@ class EqualityReader:
         }
         values.children(section, "<equality>", (*KINDS, *REFUSED), (), (*KINDS, *REFUSED))
         for node in section:
-            name = node.get("name") or f"{node.tag}_{len(self.loops) + len(self.lock) + 1}"
+            count = len(self.loops) + len(self.lock)
+            name = node.get("name") or f"{values.prefix}{node.tag}_{count + 1}"
             given = self._given(node, f"equality {name!r} (<{node.tag}>)")
             if disabled or not given.flag("active", True):
                 values.remark("equality constraints that are not active are left out", name)
@@ -168,7 +177,7 @@ class EqualityReader:
             self._close(name, "frame", ends, given)
 
     def _joint(self, name: str, given: Attributes) -> None:
-        """q_1 = a_0 + a_1 q_2 with positions that are zero at the references of MuJoCo."""
+        """q_1 = a_0 + a_1 q_2 + ... with positions that are zero at the references of MuJoCo."""
         names = [given.text(key) for key in ("joint1", "joint2") if key in given]
         if "joint1" not in given:
             raise given.fault("it has no joint1", "Name the joint that follows")
@@ -177,7 +186,8 @@ class EqualityReader:
         self._couple(name, given, [{joint: 1.0} for joint in names])
 
     def _tendon(self, name: str, given: Attributes) -> None:
-        """L_1 = a_0 + a_1 L_2 of the lengths of fixed tendons, against those of the references."""
+        """L_1 = a_0 + a_1 L_2 + ... of the lengths of fixed tendons, against those of the
+        references."""
         if "tendon1" not in given:
             raise given.fault("it has no tendon1", "Name a fixed tendon")
         sides = []
@@ -199,23 +209,21 @@ class EqualityReader:
         return out
 
     def _couple(self, name: str, given: Attributes, sides: Sequence[Mapping[str, float]]) -> None:
-        """y_1 = a_0 + a_1 y_2, each y a sum of multiples of joint positions; without y_2,
+        """y_1 = a_0 + a_1 y_2 + ..., each y a sum of multiples of joint positions; without y_2,
         y_1 = a_0."""
         polynomial = np.array([0.0, 1.0, 0.0, 0.0, 0.0])
         coefficients = given.numbers("polycoef", (1, 2, 3, 4, 5), "0 1 0 0 0")
         polynomial[: coefficients.size] = coefficients
-        if len(sides) > 1 and polynomial[2:].any():
-            raise given.fault(
-                "the coefficients of the powers 2 to 4 in polycoef are not zero",
-                "Give a linear relation of two joints; others are not read by this version",
-            )
-        factors = defaultdict(float, sides[0])
-        for joint, factor in sides[-1].items() if len(sides) > 1 else ():
-            factors[joint] -= float(polynomial[1]) * factor
-        for joint in factors:
+        for joint in (joint for side in sides for joint in side):
             if joint not in self.tree.references:
                 problem = f"there is no hinge or slide {joint!r}"
                 raise self.values.unknown(given.where, problem, self.tree.references)
+        if len(sides) > 1 and polynomial[2:].any():
+            self._couple_by_polynomial(name, given, sides, polynomial)
+            return
+        factors = defaultdict(float, sides[0])
+        for joint, factor in sides[-1].items() if len(sides) > 1 else ():
+            factors[joint] -= float(polynomial[1]) * factor
         match [(joint, factor) for joint, factor in factors.items() if factor]:
             case [(joint, factor)]:
                 self.lock.append(joint)
@@ -244,13 +252,36 @@ class EqualityReader:
                     }
                 )
 
+    def _couple_by_polynomial(
+        self,
+        name: str,
+        given: Attributes,
+        sides: Sequence[Mapping[str, float]],
+        polynomial: FloatArray,
+    ) -> None:
+        """y_1 = a_0 + a_1 y_2 + ... + a_4 y_2^4, powers whose coefficient is zero at the end left
+        out."""
+        left, right = ({j: factor for j, factor in side.items() if factor} for side in sides)
+        if not left or not right:
+            raise given.fault("a side of it has no joint", 'Remove it, or write active="false"')
+        entry = {
+            "name": name,
+            "type": "coupling",
+            "joints": [*left, *(joint for joint in right if joint not in left)],
+            "polynomial": np.trim_zeros(polynomial, "b").tolist(),
+        }
+        if [*left.values(), *right.values()] != [1.0, 1.0] or left.keys() == right.keys():
+            for key, side in (("coefficients", left), ("arguments", right)):
+                entry[key] = [side.get(joint, 0.0) for joint in entry["joints"]]
+        self.loops.append(entry)
+
     # Tendons --------------------------------------------------------------------------------
 
-    def springs(self) -> None:
+    def _springs(self, tendons: Sequence[tuple[str, Element]]) -> None:
         """Read the forces of tendons: springs between two sites and those of fixed tendons act;
         the rest is no force."""
         values = self.values
-        for name, node in self._tendons:
+        for name, node in tendons:
             where = f"tendon {name!r}"
             if node.tag == "spatial":
                 given = values.resolved(node, "", where, "tendon")
@@ -266,12 +297,17 @@ class EqualityReader:
             ends = [child.get("site", "") for child in node if child.tag == "site"]
             rest = given.numbers("springlength", (1, 2), "-1")
             between = node.tag == "fixed" or len(node) == len(ends) == 2
-            if not between or friction or armature or np.ptp(rest) != 0.0:
-                raise given.fault(
-                    "only springs and dampers of fixed tendons and between two sites, with one "
-                    "rest length, are read",
-                    "Remove its stiffness, damping, frictionloss and armature",
-                )
+            for refused, problem in (
+                (not between, "it is a spring or damper that does not go between two sites"),
+                (friction, "its frictionloss would act on several joints or along a line"),
+                (armature, "its armature would act on several joints or along a line"),
+                (np.ptp(rest) != 0.0, "its spring is slack between two lengths (springlength)"),
+            ):
+                if refused:
+                    raise given.fault(
+                        f"{problem}, which is not read by this version",
+                        "Remove its stiffness, damping, frictionloss or armature",
+                    )
             if node.tag == "fixed":
                 self._fixed_spring(name, node, where, stiffness, damping, float(rest[0]))
                 continue

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -156,7 +155,7 @@ def _of_mesh(given: Attributes, mesh: Mesh | None, reach: Reach) -> pin.Inertia:
     if mesh is None:
         raise given.fault("its mesh has no file", f"{GIVE_INERTIAL}, or the <mesh> a file")
     with naming(file=given.values.file, element=given.where):
-        path = reach.find(mesh.file, Path(given.values.file).parent, "mesh file")
+        path = reach.find(mesh.file, given.values.folder, "mesh file")
     try:
         vertices, faces = read_mesh(path)
     except InputError as error:

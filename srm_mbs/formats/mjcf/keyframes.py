@@ -7,9 +7,8 @@ in the world, and quaternions begin with the real part.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import Any
-from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
@@ -19,29 +18,32 @@ from srm_mbs.errors import known_names
 from srm_mbs.formats.graph.joint_graph import ROOT_JOINT
 from srm_mbs.formats.mjcf.attributes import Attributes, MjcfValues
 from srm_mbs.formats.mjcf.bodies import BodyReader
+from srm_mbs.formats.mjcf.parts import Part
 
 SIZES = {"hinge": (1, 1), "slide": (1, 1), "ball": (4, 3), "free": (7, 6)}
 """Numbers of positions and rates of each type of joint."""
 
 
 class KeyframeReader:
-    """The keyframes of a file, and its start in one of them.
+    """The keyframes of the files, and a start in one of them.
+
+    That of an attached file has the joints of the file alone; the others are in their zeros.
 
     Parameters
     ----------
     values, tree
-        The file, and its bodies and joints.
-    sections
-        The ``<keyframe>`` elements.
+        The main file, and the bodies and joints of all.
     """
 
-    def __init__(self, values: MjcfValues, tree: BodyReader, sections: Sequence[Element]) -> None:
+    def __init__(self, values: MjcfValues, tree: BodyReader) -> None:
         self.values, self.tree = values, tree
         self.keys: dict[str, Attributes] = {}
-        for section in sections:
-            for node in section:
+        self._parts: dict[str, Part] = {}
+        for part in tree.parts:
+            for node in (key for section in part.root.findall("keyframe") for key in section):
                 name = node.get("name") or str(len(self.keys))
-                self.keys[name] = values.own(node, f"<keyframe>, key {name!r}")
+                self.keys[name] = part.values.own(node, f"<keyframe>, key {name!r}")
+                self._parts[name] = part
 
     def start(self, wanted: str | None, closed: bool, joints: Collection[str]) -> dict[str, Any]:
         """The entry ``initial`` of a description that starts in the keyframe ``wanted``.
@@ -71,7 +73,7 @@ class KeyframeReader:
         if wanted not in self.keys:
             problem = f"there is no keyframe {wanted!r}"
             raise self.values.unknown("<keyframe>", problem, self.keys)
-        given, order = self.keys[wanted], self.tree.order
+        given, order = self.keys[wanted], self.tree.order[self._parts[wanted].joints]
         sizes = np.array([SIZES[kind] for _, kind, _ in order]).reshape(-1, 2)
         qpos, qvel = (
             given.numbers(key, total) if given.text(key).strip() else None

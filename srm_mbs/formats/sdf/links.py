@@ -208,7 +208,7 @@ class Frames:
 LINK_READ = ("pose", "inertial", "visual", "gravity", "kinematic", "static")
 LINK_IGNORED = words(
     "collision self_collide enable_wind must_be_base_link velocity_decay sensor projector "
-    "audio_sink audio_source battery light particle_emitter plugin"
+    "audio_sink audio_source battery light particle_emitter plugin contact"
 )
 INERTIAL_READ = ("pose", "frame", "mass", "inertia", "density")
 INERTIAL_IGNORED = ("auto_inertia_params",)

@@ -27,7 +27,7 @@ from srm_mbs.formats.toml.schema import (
     StrictEntry,
     TopEntry,
 )
-from srm_mbs.formats.translation import MODEL_KEYS
+from srm_mbs.formats.translation import MODEL_KEYS, PLANAR
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure
 from srm_mbs.model.drives import Drive
@@ -96,6 +96,17 @@ class Description(TopEntry):
                 for key, value in entry:
                     if isinstance(value, AnchorEntry):
                         yield f"{kind}[{i}].{key}", value
+        yield from ((f"points.{name}", anchor) for name, anchor in self.points.items())
+
+    def named_points(self) -> dict[str, Anchor]:
+        """The points of ``[points]`` by name.
+
+        Raises
+        ------
+        InputError
+            For an anchor without link or frame.
+        """
+        return {name: _anchor(f"points.{name}", "", entry) for name, entry in self.points.items()}
 
     def force_elements(self, tables: CsvFolder | None) -> tuple[ForceElement, ...]:
         """The force elements; without ``tables`` those that follow a law are left out.
@@ -163,7 +174,7 @@ def _anchor(label: str, side: str, entry: Any) -> Anchor:
         return Anchor(**dict(entry))
     except InputError as error:
         what = "" if error.element == "anchor" else f": {error.element}"
-        error.element = f"{label}, anchor {side}{what}"
+        error.element = f"{label}, anchor {side}{what}" if side else f"{label}{what}"
         raise
 
 
@@ -353,16 +364,18 @@ def check_description(entries: Mapping[str, Any], file: str) -> Description:
         description = Description.model_validate(entries)
     except ValidationError as error:
         key, problem, remedy = _explain(error)
+        key = _with_names(key, entries)
         if key == "format":
             remedy = "Write: format = 1"
         raise InputError(problem, file=file, element=key, remedy=remedy) from error
-    given = [key for key in MODEL_KEYS if getattr(description, key) is not None]
+    sources = (*MODEL_KEYS, PLANAR)
+    given = [key for key in sources if getattr(description, key) is not None]
     if len(given) != 1:
         raise InputError(
             f"{' and '.join(given)} are both given" if given else "this key is missing",
             file=file,
             element=given[0] if given else "urdf",
-            remedy=f"Give one of {', '.join(MODEL_KEYS)}",
+            remedy=f"Give one of {', '.join(sources)}",
         )
     for i, entry in enumerate(description.loop):
         if entry.type not in CLOSURE_TYPES:
@@ -392,6 +405,7 @@ PROBLEMS: dict[str, tuple[str | None, str]] = {
     "greater_than": (None, "Give a positive number"),
     "greater_than_equal": (None, "Give a number of at least 0"),
     "massless": (None, 'Write "fix", or { mass = m, inertia = I } with positive numbers'),
+    "direction": (None, "Give an angle, [x, y], or the names of two points"),
     "too_short": (None, "Give the right number of values"),
     "too_long": (None, "Give the right number of values"),
     "literal_error": (None, "Choose one of those"),
@@ -436,6 +450,16 @@ def _key_path(location: tuple[int | str, ...]) -> str:
     for part in location:
         path += f"[{part}]" if isinstance(part, int) else f".{part}"
     return path.removeprefix(".")
+
+
+def _with_names(key: str, entries: Mapping[str, Any]) -> str:
+    """A key of the section ``[planar]`` with the name of its bar or slider instead of a number."""
+    found = re.match(r"planar\.(bar|slider)\[(\d+)\]", key)
+    if found is None:
+        return key
+    table = entries[PLANAR][found[1]][int(found[2])]
+    name = table.get("name") if isinstance(table, dict) else None
+    return f"planar.{found[1]} {name!r}{key[found.end() :]}" if isinstance(name, str) else key
 
 
 def _known_keys(location: tuple[int | str, ...]) -> str:

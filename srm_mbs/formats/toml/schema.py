@@ -52,7 +52,19 @@ def _massless(value: Any) -> str | dict[str, float]:
     raise PydanticCustomError("massless", "a treatment of massless ends is wanted")
 
 
+def _direction(value: Any) -> float | list[float] | list[str]:
+    if not isinstance(value, list):
+        return _number(value)
+    if len(value) != 2:
+        raise PydanticCustomError("direction", "a direction of the plane is wanted")
+    if all(isinstance(part, str) for part in value):
+        return value
+    return [_number(part) for part in value]
+
+
 Number = Annotated[float, PlainValidator(_number)]
+Direction = Annotated[float | list[float] | list[str], PlainValidator(_direction)]
+"""Of the plane: an angle against x, two components, or the names of two points."""
 Massless = Annotated[str | dict[str, float], PlainValidator(_massless)]
 Positive = Annotated[Number, pydantic.Field(gt=0)]
 NotNegative = Annotated[Number, pydantic.Field(ge=0)]
@@ -183,6 +195,102 @@ AnyForceEntry: Any = Annotated[
 # -- the other tables ------------------------------------------------------------------------
 
 
+PlanePoint = Annotated[list[Number], pydantic.Field(min_length=2, max_length=2)]
+Pair = Annotated[list[StrictStr], pydantic.Field(min_length=2, max_length=2)]
+LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
+"""Units of the lengths of a planar linkage, in m."""
+
+
+class PlanarBar(StrictEntry):
+    """One ``[[planar.bar]]``: a rigid body through two points, or a plate through more.
+
+    ``length`` is that of a bar of two points; ``mass`` (kg), ``mass_per_length`` (kg/m),
+    ``inertia`` (kg m^2) about the centre of mass and normal to the plane, ``centre`` as drawn.
+    """
+
+    name: StrictStr
+    points: list[StrictStr]
+    length: Positive | None = None
+    mass: NotNegative | None = None
+    mass_per_length: NotNegative | None = None
+    inertia: NotNegative | None = None
+    centre: PlanePoint | None = None
+
+
+class PlanarSlider(StrictEntry):
+    """One ``[[planar.slider]]``: ``point`` moves along a line of the ground, or of the bar ``on``.
+
+    With ``mass`` (kg) it is a body of that name, which keeps the orientation of its line and has
+    ``inertia`` (kg m^2).
+    """
+
+    name: StrictStr
+    point: StrictStr
+    along: Direction
+    on: StrictStr = ""
+    mass: NotNegative = 0.0
+    inertia: NotNegative = 0.0
+
+
+class PlanarLength(StrictEntry):
+    """One ``[[planar.length]]``: the distance of two points of a bar."""
+
+    between: Pair
+    length: Positive
+
+
+class PlanarSpring(StrictEntry):
+    """One ``[[planar.spring]]``: spring (N/m) and damper (N s/m) between two points."""
+
+    a: StrictStr
+    b: StrictStr
+    stiffness: NotNegative = 0.0
+    damping: NotNegative = 0.0
+    rest_length: NotNegative | None = None
+    name: StrictStr = ""
+
+
+class PlanarTorque(StrictEntry):
+    """One ``[[planar.torque]]``: N m on a pin, N on a slider."""
+
+    pin: StrictStr
+    torque: Number
+
+
+class PlanarLoad(StrictEntry):
+    """One ``[[planar.load]]``: a constant force (N) on a point, in the directions x, y."""
+
+    point: StrictStr
+    force: PlanePoint
+
+
+PlanarDrive: Any = _entry(
+    "PlanarDrive",
+    "One ``[[planar.drive]]``: the motion of a pin or slider, and the keys of its law.",
+    {"pin": (StrictStr, ...), **_LAW, "absolute": (StrictBool, False)},
+)
+
+
+class PlanarEntry(StrictEntry):
+    """``[planar]``: a planar linkage by its points and bars (docs/formats.md)."""
+
+    unit: Literal["m", "cm", "mm", "in"] = "m"
+    angle: Literal["rad", "deg"] = "rad"
+    points: dict[StrictStr, PlanePoint]
+    bar: list[PlanarBar]
+    ground: list[StrictStr]
+    slider: list[PlanarSlider] = []
+    length: list[PlanarLength] = []
+    mass_per_length: NotNegative | None = None
+    gravity: PlanePoint | None = None
+    start: dict[StrictStr, Number] = {}
+    rates: dict[StrictStr, Number] = {}
+    spring: list[PlanarSpring] = []
+    torque: list[PlanarTorque] = []
+    load: list[PlanarLoad] = []
+    drive: list[PlanarDrive] = []
+
+
 class InitialEntry(StrictEntry):
     """``[initial]``: held positions and rates, and guesses, by joint name."""
 
@@ -207,6 +315,7 @@ class TopEntry(StrictEntry):
     urdf: StrictStr | None = None
     sdf: StrictStr | None = None
     mjcf: StrictStr | None = None
+    planar: PlanarEntry | None = None
     cut: list[StrictStr] = []
     base: Base = "fixed"
     gravity: Vector = [0.0, 0.0, -9.81]
@@ -219,5 +328,6 @@ class TopEntry(StrictEntry):
     loop: list[LoopEntry] = []
     force: list[AnyForceEntry] = []
     drive: list[DriveEntry] = []
+    points: dict[StrictStr, AnchorEntry] = {}
     initial: InitialEntry = InitialEntry()
     simulation: SimulationEntry = SimulationEntry()

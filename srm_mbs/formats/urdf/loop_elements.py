@@ -51,13 +51,22 @@ End = tuple[str, pin.SE3]
 
 
 class LoopElements(ElementChecker):
-    """Reads the loop elements of one URDF into :attr:`loops` and :attr:`forces`."""
+    """Reads the loop elements of one URDF into :attr:`loops` and :attr:`forces`.
 
-    def __init__(self, file: str, graph: Graph) -> None:
+    Parameters
+    ----------
+    file, graph
+        The file, and its links and joints.
+    fixed_base
+        Whether the ground holds the root link.
+    """
+
+    def __init__(self, file: str, graph: Graph, fixed_base: bool) -> None:
         super().__init__(file)
-        self.graph = graph
+        self.graph, self.fixed_base = graph, fixed_base
         self.loops: list[dict[str, Any]] = []
         self.forces: list[dict[str, Any]] = []
+        self._on_screws: set[str] = set()
         self._readers: dict[str, Callable[[Element, str], None]] = {
             "loop": self._loop,
             "coupling": self._coupling,
@@ -343,12 +352,20 @@ class LoopElements(ElementChecker):
             raise self.fault(where, "another joint has its name", "Rename one of them")
         pitch = self._gazebo_pitch(joint, where)
         parent, child, (axis, _), damping = self._gazebo_ends(joint, where)
-        if WORLD in (parent[0], child[0]):
-            raise self.fault(where, "a screw on the ground is not read", "Name two links")
         if axis is None:
             raise self.fault(where, "it has no <axis>", "Give it")
-        if child[0] in self.graph.ancestors(parent[0]):
-            parent, child, axis = child, parent, -axis
+        if WORLD in (parent[0], child[0]) and WORLD not in self.graph.links:
+            parent, child = self._on_root(parent, child, where)
+        ways = [(parent, child, axis), (child, parent, -axis)]
+        ways = [
+            way
+            for way in ways
+            if way[1][0] not in (*self.graph.ancestors(way[0][0]), *self._on_screws)
+        ]
+        if not ways:
+            raise self.fault(where, "other screws hold both its links", "Remove one of them")
+        parent, child, axis = ways[0]
+        self._on_screws.add(child[0])
         screw = SubElement(root, "joint", name=name, type="screw")
         SubElement(screw, "axis", xyz=numbers(axis))
         SubElement(screw, "thread_pitch", value=numbers([pitch]))
@@ -356,13 +373,32 @@ class LoopElements(ElementChecker):
             SubElement(screw, "dynamics", damping=numbers([damping]))
         if is_identity(child[1]):
             _hang(screw, parent[0], child[0], parent[1])
+            self.graph.above[child[0]] = screw
             return name
         between = f"{name}::joint_frame"
         SubElement(root, "link", name=between)
         _hang(screw, parent[0], between, parent[1])
         fixed = SubElement(root, "joint", name=f"{name}::fixed", type="fixed")
         _hang(fixed, between, child[0], child[1].inverse())
+        self.graph.above |= {between: screw, child[0]: fixed}
         return f"{name}::fixed"
+
+    def _on_root(self, parent: End, child: End, where: str) -> tuple[End, End]:
+        """The two ends of a screw on the ground, with the root link, which it holds, instead."""
+        if not self.fixed_base:
+            raise self.fault(
+                where,
+                "a screw on the ground of a base that is not fixed is not read",
+                'Give base = "fixed"',
+            )
+        link = child[0] if parent[0] == WORLD else parent[0]
+        root = self.graph.ancestors(link)[-1]
+        if link == root:
+            raise self.fault(
+                where, f"it holds the root link {link!r}, which the ground holds", "Remove it"
+            )
+        ground = [(root if end[0] == WORLD else end[0], end[1]) for end in (parent, child)]
+        return ground[0], ground[1]
 
     def _gazebo_pitch(self, joint: Element, where: str) -> float:
         """Metres per turn of a screw, whose elements about it are removed."""

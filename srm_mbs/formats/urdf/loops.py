@@ -95,7 +95,8 @@ def translate(document: Document, options: Options) -> Translation:
     extended = ElementChecker(document.file)
     found = rewrite(root, extended)
     notes = extended.notes
-    elements = LoopElements(document.file, Graph(root))
+    fixed_base = (options.base or options.own.get("base", "fixed")) == "fixed"
+    elements = LoopElements(document.file, Graph(root), fixed_base)
     held = elements.screws(root)
     found |= _cut_second_parents(root, elements, options, notes, held) or bool(held)
     elements.graph = graph = Graph(root)

@@ -329,6 +329,9 @@ class UrdfChecker(ElementChecker):
                 + (f' with base = "{base}"' if name == ROOT_JOINT else ""),
                 "Rename the joint",
             )
+        axis = joint.find("axis")
+        if axis is not None and not any(self.vector_or_zero(axis, "rpy", where)):
+            axis.attrib.pop("rpy", None)  # of no meaning in URDF, but written with zeros
         self.children(joint, where)
         kind = joint.get("type")
         if kind not in JOINT_TYPES:

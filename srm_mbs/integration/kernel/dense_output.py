@@ -12,6 +12,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.integration.dense_output import DenseOutput, StepData
 from srm_mbs.integration.kernel import marshalling
+from srm_mbs.integration.kernel.observables import CompiledObservables
 from srm_mbs.integration.kernel.system import make_kernel_system, shared, workspace
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
@@ -60,6 +61,11 @@ class CompiledDenseOutput(DenseOutput):
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy may be loaded where there is no kernel.
         return dense_output, (self._mechanism_system, self._scheme, self._steps, "kernel")
+
+    @cached_property
+    def observables(self) -> CompiledObservables:
+        """Quantities at many states of the mechanism of the run."""
+        return CompiledObservables(self._mechanism_system)
 
     def __call__(self, t: FloatArray) -> FloatArray:
         """States (k, nx) at the times ``t`` (k,), in any order; see

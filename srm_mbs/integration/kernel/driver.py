@@ -88,7 +88,7 @@ def integrate(
             if sink is not None and run.count >= sink.block:
                 sink.take(record.data(run.method.scheme, system.tangent_size))
                 record.rest = run.t, run.state
-            made = run.count
+            made = run.count if one_by_one or sink is not None else 0
             stride = getattr(tick, "stride", 1) if events is None else 1  # a tick may change it
             block = 0 if sink is None else sink.block - made
             reason = run.advance(stride if one_by_one else block)

@@ -9,6 +9,7 @@ rows.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -197,6 +198,7 @@ def tableau_struct(scheme: ButcherTableau) -> Any:
     )
 
 
+@lru_cache(maxsize=64)
 def norm_struct(norm: ErrorNorm) -> Any:
     """``ErrorNorm`` of step.hpp."""
     return _core.ErrorNorm(
@@ -295,6 +297,7 @@ def control_struct(**state: float) -> Any:
     return _core.ControlState(**_CONTROL_START | state)
 
 
+@lru_cache(maxsize=64)
 def intervals_struct(intervals: SmoothIntervals) -> Any:
     """``SmoothIntervals`` of run.hpp."""
     return _core.SmoothIntervals(
@@ -312,6 +315,7 @@ def collocation_struct(count: int) -> Any:
     return _core.Collocation(nodes=nodes, weights=weights, integrals=integrals)
 
 
+@lru_cache(maxsize=64)
 def options_struct(
     *,
     t0: float,
@@ -383,7 +387,6 @@ def scheme_denses(scheme: ButcherTableau) -> list[SchemeDense]:
 
 
 _STEP_ARRAYS = ("times", "states", "rates", "corrections", "sigmas", "end_rate", "stiff")
-_STEP_NUMBERS = ("ranks", "error_ratios", "placements", "held")
 
 
 def steps_struct(steps: StepData) -> Any:
@@ -400,15 +403,27 @@ def steps_struct(steps: StepData) -> Any:
 
 def steps_from(records: Any, stop: float | None) -> StepData:
     """The accepted steps in ``StepRecords`` of the kernel; its arrays are not copied."""
+    ranks, error_ratios, placements, held, stiff = records.numbers
+    steps = StepData(
+        records.times,
+        records.states,
+        records.rates,
+        records.corrections,
+        records.sigmas,
+        ranks,
+        error_ratios,
+        placements,
+        held,
+        records.end_rate,
+        {zone.step: (zone.threshold, history_from(zone.history)) for zone in records.zones},
+        stop,
+        stiff=stiff,
+    )
+    if not records.break_count:
+        return steps
     breaks = records.breaks.astype(int)
     inside = breaks > 0  # others end steps that were taken before
-    return StepData(
-        **{name: getattr(records, name) for name in (*_STEP_ARRAYS, *_STEP_NUMBERS)},
-        zones={zone.step: (zone.threshold, history_from(zone.history)) for zone in records.zones},
-        stop=stop,
-        breaks=breaks[inside],
-        break_rates=records.break_rates[inside] if len(breaks) else records.break_rates,
-    )
+    return replace(steps, breaks=breaks[inside], break_rates=records.break_rates[inside])
 
 
 def system_struct(constants: dict[str, Any]) -> Any:
@@ -429,7 +444,7 @@ def system_struct(constants: dict[str, Any]) -> Any:
             for row, other, factor, columns in data.pop("eliminations")
         ],
         drives=[_driven_row(**row) for row in data.pop("drives")],
-        forces=[_force(**force) for force in data.pop("forces")],
+        forces=[force_struct(**force) for force in data.pop("forces")],
         groups=[
             _core.GroupJoint(group=_GROUPS.index(group), start=start, size=size, position=position)
             for group, start, size, position in data.pop("groups")
@@ -454,7 +469,7 @@ def _driven_row(curve: dict[str, Any], wound: bool, **row: Any) -> Any:
 _NO_ANCHOR = (0, np.zeros(12))
 
 
-def _force(
+def force_struct(
     kind: int,
     a: tuple[int, FloatArray] = _NO_ANCHOR,
     b: tuple[int, FloatArray] = _NO_ANCHOR,

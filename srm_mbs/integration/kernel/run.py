@@ -16,7 +16,8 @@ from srm_mbs.integration.control.step_size import StepDecision
 from srm_mbs.integration.events import StepDense, step_dense
 from srm_mbs.integration.kernel import marshalling
 from srm_mbs.integration.kernel.marshalling import CONSTANTS, DECISIONS
-from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
+from srm_mbs.integration.kernel.system import Evaluator
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, StepResult
 from srm_mbs.integration.methods.psrm import PSRM
 
 CHUNK = 0.1
@@ -47,6 +48,41 @@ class ReturnReason(IntEnum):
     """The end lies next to a singular configuration."""
 
 
+def first_stage(
+    evaluator: Evaluator,
+    method: Method,
+    t: float,
+    state: FloatArray,
+    norm: ErrorNorm,
+    t_end: float,
+    stiff: bool,
+) -> Any:
+    """The ``IntegratorState`` of step.hpp at the start of a run: as
+    :func:`~srm_mbs.integration.singular_endpoints.start`, which makes it next to a singular
+    configuration.
+
+    Parameters
+    ----------
+    evaluator
+        The mechanism.
+    stiff
+        Whether the problem is stiff at the start, as far as is known.
+
+    Raises
+    ------
+    InputError, EvaluationError
+        As ``start``.
+    """
+    with suppress(ArithmeticError):  # the reference raises the error that says why
+        found = evaluator.kernel_system.first_stage(t, state, stiff)
+        if not found.sigma < singular_endpoints.NEAR_SINGULAR_SIGMA:
+            return found
+    system = evaluator.system
+    memory = singular_endpoints.start(system, method, t, state, norm, t_end, evaluator)
+    memory.stiff = stiff
+    return marshalling.state_struct(memory)
+
+
 class CompiledRun:
     """A run of the kernel that can be advanced step by step.
 
@@ -54,8 +90,11 @@ class CompiledRun:
     ----------
     kernel_system
         From :func:`~srm_mbs.integration.kernel.system.make_kernel_system`.
-    method, norm, memory, state
+    method, norm, state
         As for :func:`~srm_mbs.integration.driver.integrate`.
+    memory
+        Before the first step: from :func:`first_stage`, or
+        :func:`~srm_mbs.integration.kernel.marshalling.state_struct`.
     intervals
         The smooth intervals of the run, which ends with the last one.
     t0
@@ -83,7 +122,7 @@ class CompiledRun:
         kernel_system: Any,
         method: PSRM,
         norm: ErrorNorm,
-        memory: IntegratorState,
+        memory: Any,
         state: FloatArray,
         intervals: SmoothIntervals,
         *,
@@ -116,7 +155,7 @@ class CompiledRun:
             None if stiff is None else marshalling.tableau_struct(stiff),
             CONSTANTS,
             marshalling.norm_struct(norm),
-            marshalling.state_struct(memory),
+            memory,
             state,
             marshalling.intervals_struct(intervals),
             options,

@@ -109,31 +109,31 @@ class Evaluator:
     """
 
     def __init__(self, system: ClosedSystem | OpenSystem, kernel_system: Any) -> None:
-        self._system = system
-        self._kernel_system = kernel_system
+        self.system = system
+        self.kernel_system = kernel_system
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._system, name)
+        return getattr(self.system, name)
 
     def between(self, first: float, last: float) -> None:
         """Evaluate both at times within [``first``, ``last``] (s) only: between breakpoints."""
-        self._system.between(first, last)
-        self._kernel_system.between(first, last)
+        self.system.between(first, last)
+        self.kernel_system.between(first, last)
 
     def begin_step(self, t: float, state: FloatArray) -> None:
         """Begin a step of both from ``state`` at ``t`` (s)."""
-        self._system.begin_step(t, state)
-        self._kernel_system.begin_step(t, state)
+        self.system.begin_step(t, state)
+        self.kernel_system.begin_step(t, state)
 
     def branch_nodes(self, norm: ErrorNorm) -> CompiledNodes:
         """Makes the nodes of the motion next to a singular configuration."""
-        return CompiledNodes(self._kernel_system, norm)
+        return CompiledNodes(self.kernel_system, norm)
 
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Any:
         """Terms of a stage; see :class:`~srm_mbs.dynamics.system.System`."""
         if zone is None:
             try:
-                return _KernelTerms(self._kernel_system.terms(t, state))
+                return _KernelTerms(self.kernel_system.terms(t, state))
             except ArithmeticError:
                 pass  # the reference raises the error that says why
-        return self._system.evaluate(t, state, zone)
+        return self.system.evaluate(t, state, zone)

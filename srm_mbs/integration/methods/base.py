@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -23,7 +24,7 @@ NEGLIGIBLE = 1e-3
 """Effect of an evaluation, over the tolerance, below which it is not made."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ErrorNorm:
     """Weighted root mean square of the thesis, (B.4).
 
@@ -47,7 +48,7 @@ class ErrorNorm:
     negligible: float = NEGLIGIBLE
     unit: FloatArray | None = None
 
-    @property
+    @cached_property
     def one(self) -> FloatArray:
         """atol / rtol (n,): the size at which both tolerances allow the same error."""
         return self.atol / self.rtol
@@ -285,7 +286,7 @@ class DelegatingMethod(ABC):
 
     tableau: str | ButcherTableau
 
-    @property
+    @cached_property
     def scheme(self) -> ButcherTableau:
         """The Runge-Kutta data."""
         return get_tableau(self.tableau)

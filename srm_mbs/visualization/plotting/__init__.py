@@ -10,13 +10,17 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.formats.files import checked_path
+from srm_mbs.model.numbers import finite_array
 from srm_mbs.visualization.plotting.dae import draw_dae_run, draw_dae_state
 from srm_mbs.visualization.plotting.energy import draw_balance
-from srm_mbs.visualization.plotting.figure import check_suffix, save
+from srm_mbs.visualization.plotting.figure import FONT_SIZE, check_suffix, save
 from srm_mbs.visualization.plotting.joints import draw_phase, draw_state
 from srm_mbs.visualization.plotting.path import draw_path
+from srm_mbs.visualization.plotting.points import draw_points
 from srm_mbs.visualization.plotting.reactions import draw_reactions
 from srm_mbs.visualization.plotting.run import draw_run, draw_sigma
 
@@ -39,8 +43,14 @@ KINDS: Kinds = {
     "sigma": draw_sigma,
     "phase": draw_phase,
     "path": draw_path,
+    "point": draw_points,
 }
 """Those of a run of a mechanism."""
+
+COMMON = ("title", "size")
+"""Options of every kind."""
+LARGEST_SIZE = 100.0
+"""Largest width or height (inch) of a figure."""
 
 DAE_KINDS: Kinds = {"run": draw_dae_run, "state": draw_dae_state}
 """Those of a run of a DAE."""
@@ -61,13 +71,33 @@ def check_options(kind: str, options: Iterable[str] = (), kinds: Kinds = KINDS) 
             remedy=f"Known: {', '.join(kinds)}",
         )
     _, *known = inspect.signature(kinds[kind]).parameters
+    known += COMMON
     for name in options:
         if name not in known:
             raise InputError(
                 f"a picture of kind {safe_repr(kind)} has no such option",
                 element=name,
-                remedy=f"Known: {', '.join(known) or 'none'}",
+                remedy=f"Known: {', '.join(known)}",
             )
+
+
+def checked_size(size: Any) -> tuple[float, float]:
+    """Width and height (inch) of a figure.
+
+    Raises
+    ------
+    InputError
+        Unless ``size`` is two positive numbers of at most LARGEST_SIZE.
+    """
+    numbers = finite_array(size, (2,))
+    if numbers is None or not np.all((numbers > 0.0) & (numbers <= LARGEST_SIZE)):
+        raise InputError(
+            f"{safe_repr(size)} is not the size of a figure",
+            element="size",
+            remedy=f"Give width and height in inches, (7.0, 5.0) for example, up to "
+            f"{LARGEST_SIZE:g}",
+        )
+    return float(numbers[0]), float(numbers[1])
 
 
 def plot_solution(
@@ -77,19 +107,36 @@ def plot_solution(
     return _plot(KINDS, solution, path, kind, **options)
 
 
-def plot_dae(solution: DaeResult, path: str | Path | None = None, kind: str = "run") -> Figure:
+def plot_dae(
+    solution: DaeResult, path: str | Path | None = None, kind: str = "run", **options: Any
+) -> Figure:
     """Plot a run of a DAE; see :meth:`srm_mbs.DaeSolution.plot`."""
-    return _plot(DAE_KINDS, solution, path, kind)
+    return _plot(DAE_KINDS, solution, path, kind, **options)
 
 
 def _plot(
-    kinds: Kinds, solution: Any, path: str | Path | None, kind: str, **options: Any
+    kinds: Kinds,
+    solution: Any,
+    path: str | Path | None,
+    kind: str,
+    title: str | None = None,
+    size: Any = None,
+    **options: Any,
 ) -> Figure:
     check_options(kind, options, kinds)
+    inches = None if size is None else checked_size(size)
+    if title is not None and not isinstance(title, str):
+        raise InputError(
+            f"{safe_repr(title)} is not a text", element="title", remedy="Give a string"
+        )
     file = None if path is None else checked_path(path)
     if file is not None:
         check_suffix(file)
     figure = kinds[kind](solution, **options)
+    if title is not None:
+        figure.suptitle(title, fontsize=FONT_SIZE + 1.5, parse_math=False)
+    if inches is not None:
+        figure.set_size_inches(*inches)
     if file is not None:
         save(figure, file)
     return figure

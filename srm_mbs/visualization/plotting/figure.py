@@ -23,9 +23,12 @@ from matplotlib.ticker import (
     NullLocator,
     ScalarFormatter,
 )
+from numpy.typing import NDArray
 
-from srm_mbs.errors import InputError, get_logger
+from srm_mbs.dynamics.scaling import is_angle
+from srm_mbs.errors import InputError, get_logger, known_names, safe_repr
 from srm_mbs.formats.files import writing
+from srm_mbs.model.anchors import one_degree_joint
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.sampling import Run, jumps, passages, thinned
 
@@ -48,6 +51,8 @@ FEW_POINTS = 50
 """Lines through fewer points have markers, without which a single point would be invisible."""
 TICK_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 """Leading digits of the distance of ticks."""
+ANGLE_STEPS = (1.0, 1.5, 3.0, 4.5, 9.0, 10.0)
+"""Those of an axis in degrees."""
 PLAIN_POWERS = range(-2, 4)
 """Powers of ten whose values are written in full at the ticks."""
 SMALLEST_RELATIVE_RANGE = 1e-6
@@ -67,6 +72,9 @@ LINES: tuple[tuple[str, Any], ...] = (
 )
 """Colours of lines with their dashes, which distinguish them in grey print."""
 
+WIDE_TICKS, NARROW_TICKS = 10, 5
+"""Largest numbers of intervals between the ticks of a horizontal axis, and of one of three side by
+side."""
 WIDTH = 7.0
 """Width of the figure (inch), within the text of an A4 or letter page."""
 FONT_SIZE = 8.5
@@ -98,6 +106,8 @@ MARKED: tuple[tuple[Callable[[Run], list[float]], str, str, dict[str, Any]], ...
     ),
 )
 """Vertical lines: their times (s), their meaning in a legend and in a note, and their style."""
+PER_TIME = ("", "/s", "/s²")
+"""Units of positions, rates and accelerations after that of the positions."""
 Draw = Callable[["Axes"], str]
 """Draws into a panel and returns its title."""
 Lines = Mapping[str, "FloatArray"]
@@ -310,10 +320,94 @@ def above_zero(values: FloatArray, least: float) -> tuple[FloatArray, str]:
     return np.maximum(values, least), note
 
 
+class Abscissa:
+    """The horizontal axis of panels: time, or the position of a joint.
+
+    Parameters
+    ----------
+    solution
+        The run.
+    joint
+        Name of a joint of one degree of freedom; by default the axis is time.
+    unit
+        Of the joint: ``rad`` or ``deg`` for angles, ``m`` or ``mm`` for lengths; rad and m by
+        default.
+
+    Raises
+    ------
+    InputError
+        If there is no such joint, it has several degrees of freedom, or the unit is not one of its
+        positions.
+    """
+
+    def __init__(self, solution: Run, joint: str | None = None, unit: str | None = None) -> None:
+        self._solution, self._joint = solution, None
+        self._factor, self.turns = 1.0, False
+        self.label = f"time{seconds(solution)}"
+        if joint is None or not isinstance(solution, SimulationResult):
+            if unit is not None:
+                raise InputError(
+                    "it is the unit of the joint on the horizontal axis, and that is time",
+                    element="unit",
+                    remedy='Give for example x="crank" too, or leave it out',
+                )
+            return
+        model = solution.mechanism.model
+        one_degree_joint(model, joint, "x", "Give a joint of one degree of freedom")
+        self.turns = is_angle(model, joint)
+        factors = {"rad": 1.0, "deg": 180.0 / np.pi} if self.turns else {"m": 1.0, "mm": 1e3}
+        unit = next(iter(factors)) if unit is None else unit
+        if unit not in factors:
+            raise InputError(
+                f"joint {joint!r} has no positions in {safe_repr(unit)}",
+                element="unit",
+                remedy=known_names(factors),
+            )
+        self._joint, self._factor, self._unit = joint, factors[unit], unit
+        self.label = f"{plain(joint)} ({unit})"
+
+    @property
+    def is_time(self) -> bool:
+        """Whether it is the time."""
+        return self._joint is None
+
+    def of(self, run: Run) -> FloatArray:
+        """Values (n,) at the times of ``run``."""
+        if self._joint is None or not isinstance(run, SimulationResult):
+            return run.t
+        return self._factor * run.joint(self._joint)[0]
+
+    def at(self, times: Sequence[float]) -> FloatArray:
+        """Values (k,) at ``times`` (s)."""
+        if self._joint is None or not isinstance(self._solution, SimulationResult):
+            return np.asarray(times, dtype=float)
+        return self.of(self._solution.at(times))
+
+    def finish(self, panels: Sequence[Axes], ticks: int = WIDE_TICKS) -> None:
+        """Limits, label and ticks, with at most ``ticks`` intervals, below the last of ``panels``,
+        which share the axis."""
+        last = panels[-1]
+        last.set_xlabel(self.label, fontsize=FONT_SIZE)
+        if self._joint is None:
+            start, end = self._solution.span
+            margin = 0.01 * (end - start) or 1.0
+            last.set_xlim(start - margin, end + margin)
+        else:
+            for axes in panels:
+                axes.margins(x=0.01)
+        steps = ANGLE_STEPS if self._factor != 1.0 and self.turns else TICK_STEPS
+        last.xaxis.set_major_locator(MaxNLocator(ticks, steps=steps))
+
+
 def time_panels(
-    solution: Run, draws: Sequence[Draw], notes: Sequence[str] = (), height: float = 1.65
+    solution: Run,
+    draws: Sequence[Draw],
+    notes: Sequence[str] = (),
+    height: float = 1.65,
+    abscissa: Abscissa | None = None,
 ) -> Figure:
-    """Panels below each other, each of ``height`` (inch) and drawn by one of ``draws``."""
+    """Panels below each other, each of ``height`` (inch) and drawn by one of ``draws``, over time
+    or over another ``abscissa``."""
     figure = Figure(figsize=(WIDTH, 0.7 + height * len(draws)), layout="constrained")
     panels = list(figure.subplots(len(draws), sharex=True, squeeze=False)[:, 0])
     # Drift and energy of a divergent state overflow: the curves end there.
@@ -326,19 +420,26 @@ def time_panels(
     beside = not all(legend_fits(axes) for axes in panels)
     for axes in panels:
         legend(axes, beside=beside)
-    time_axis(solution, panels)
+    (Abscissa(solution) if abscissa is None else abscissa).finish(panels)
     figure.align_ylabels(panels)
     finish(figure, solution, notes)
     return figure
 
 
-def time_axis(solution: Run, panels: Sequence[Axes]) -> None:
-    """The time of the whole run below the last of ``panels``, which share it."""
-    start, end = solution.span
-    margin = 0.01 * (end - start) or 1.0
-    panels[-1].set_xlim(start - margin, end + margin)
-    panels[-1].xaxis.set_major_locator(MaxNLocator(10, steps=TICK_STEPS))
-    panels[-1].set_xlabel(f"time{seconds(solution)}", fontsize=FONT_SIZE)
+def title_columns(
+    figure: Figure, panels: NDArray[Any], titles: Sequence[str], abscissa: Abscissa
+) -> None:
+    """Titles, legends and horizontal axes of ``panels`` (rows, columns); ``titles`` of at least as
+    many columns."""
+    for axes, title in zip(panels[0], titles):
+        axes.set_title(title, loc="left", fontsize=FONT_SIZE + 0.5)
+    # Three columns leave no room for legends: that of the first column explains its row.
+    narrow = panels.shape[1] > 2
+    for axes in (panels[:, :1] if narrow else panels).flat:
+        legend(axes, beside=False)
+    for column in panels.T:
+        abscissa.finish(list(column), NARROW_TICKS if narrow else WIDE_TICKS)
+        figure.align_ylabels(list(column))
 
 
 def finish(figure: Figure, solution: Run, notes: Sequence[str] = ()) -> None:
@@ -376,11 +477,15 @@ def some_of(names: Sequence[str]) -> str:
     return shown if more <= 0 else f"{shown} and {more} more"
 
 
-def draw_line(axes: Axes, t: FloatArray, values: FloatArray, **style: Any) -> None:
+def draw_line(axes: Axes, x: FloatArray, values: FloatArray, **style: Any) -> None:
     """A line through the distinguishable points, with gaps where they are not finite."""
     values = finite(values)
-    seen = thinned(t, values)
-    axes.plot(t[seen], values[seen], **style)
+    if np.all(np.diff(x) >= 0.0):
+        seen = thinned(x, values)
+    else:  # a curve that turns back keeps the extremes of both coordinates
+        number = np.arange(len(x), dtype=float)
+        seen = np.union1d(thinned(number, values), thinned(number, x))
+    axes.plot(x[seen], values[seen], **style)
 
 
 def in_panels(lines: Lines) -> list[Lines]:
@@ -390,25 +495,30 @@ def in_panels(lines: Lines) -> list[Lines]:
     return [{name: lines[name] for name in part} for part in parts]
 
 
-def draw_lines(axes: Axes, t: FloatArray, lines: Lines, factor: float) -> None:
+def draw_lines(axes: Axes, x: FloatArray, lines: Lines, factor: float) -> None:
     """Lines of different styles through the values over ``factor``, named in the legend."""
     for (name, values), style in zip(lines.items(), line_styles(len(lines))):
-        draw_line(axes, t, values / factor, label=plain(name), **style)
+        draw_line(axes, x, values / factor, label=plain(name), **style)
 
 
-def mark_times(axes: Axes, solution: Run, *, labelled: bool = True) -> None:
+def mark_times(
+    axes: Axes, solution: Run, *, labelled: bool = True, abscissa: Abscissa | None = None
+) -> None:
     """Mark singular passages and actions of events by vertical lines, or by ticks if they are many.
 
     Parameters
     ----------
     labelled
         Whether the legend explains them; otherwise :func:`marks_note` does.
+    abscissa
+        The horizontal axis; time by default.
     """
     for times_of, label, _, style in MARKED:
         if times := times_of(solution):
             top = 1.0 if len(times) <= MAX_FULL_LINES else 0.06
             transform, label = axes.get_xaxis_transform(), label if labelled else ""
-            axes.vlines(times, 0.0, top, transform=transform, label=label, **style)
+            at = times if abscissa is None else abscissa.at(times)
+            axes.vlines(at, 0.0, top, transform=transform, label=label, **style)
 
 
 def marks_note(solution: Run) -> list[str]:

@@ -23,11 +23,12 @@ from srm_mbs.visualization.plotting.figure import (
     BLACK,
     BLUE,
     FONT_SIZE,
+    PER_TIME,
     VERMILION,
     WIDTH,
+    Abscissa,
     draw_lines,
     finish,
-    legend,
     linear_axis,
     mark_times,
     marks,
@@ -35,10 +36,10 @@ from srm_mbs.visualization.plotting.figure import (
     plain,
     prepare,
     some_of,
-    time_axis,
+    title_columns,
     wrapped,
 )
-from srm_mbs.visualization.plotting.sampling import read_smoothly, with_gaps
+from srm_mbs.visualization.plotting.sampling import read_forces, read_smoothly, with_gaps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -81,7 +82,9 @@ class Component:
         Unwrapped angles, and rotation vectors; linear or angular rates, in the axes of the moving
         body if there are several.
     sizes
-        Typical magnitude of positions and of rates.
+        Typical magnitude of positions, rates and accelerations.
+    own
+        The columns of its rates among those of the mechanism.
     """
 
     joint: str
@@ -90,7 +93,8 @@ class Component:
     names: tuple[str, ...]
     positions: FloatArray
     rates: FloatArray
-    sizes: tuple[float, float]
+    sizes: tuple[float, float, float]
+    own: slice
 
 
 def chosen_joints(mechanism: Mechanism, joints: Sequence[str] | None) -> tuple[str, ...]:
@@ -145,8 +149,10 @@ def components(run: SimulationResult, joint: str) -> Iterator[Component]:
         part: str, own: slice, positions: FloatArray, names: tuple[str, ...], turns: bool
     ) -> Component:
         unit, size = ("rad", 1.0) if turns else ("m", units.length)
-        sizes = (size, size * units.rate)
-        return Component(joint, part, unit, names, positions, v[:, own], sizes)
+        sizes = (size, size * units.rate, size * units.rate**2)
+        first = data.idx_v
+        whole = slice(first + own.start, first + own.stop)
+        return Component(joint, part, unit, names, positions, v[:, own], sizes, whole)
 
     kind = data.shortname().removeprefix("JointModel")
     if data.nv == 1:
@@ -192,21 +198,36 @@ def rotation_vectors(quaternions: FloatArray) -> FloatArray:
     return out
 
 
-def draw_state(solution: SimulationResult, joints: Sequence[str] | None = None) -> Figure:
-    """Position and rate of each joint over time.
+def draw_state(
+    solution: SimulationResult,
+    joints: Sequence[str] | None = None,
+    accelerations: bool = False,
+    x: str | None = None,
+    unit: str | None = None,
+) -> Figure:
+    """Position and rate of each joint over time or over another joint.
 
     Parameters
     ----------
     joints
         Names of joints; by default all that fit on a page, and a note names the others.
+    accelerations
+        Whether to draw the accelerations, too.
+    x, unit
+        Joint on the horizontal axis instead of time, and its unit (:class:`.figure.Abscissa`).
 
     Raises
     ------
     InputError
-        If there is no such joint.
+        If there is no such joint; for accelerations of a loaded run that had a controller.
     """
     names = chosen_joints(solution.mechanism, joints)
-    run = read_smoothly(solution)
+    abscissa = Abscissa(solution, x, unit)
+    run = (
+        read_forces(solution, lambda run: run.accelerations)
+        if accelerations
+        else read_smoothly(solution)
+    )
     rows: list[Component] = []
     left: list[str] = []
     for name in names:
@@ -217,24 +238,21 @@ def draw_state(solution: SimulationResult, joints: Sequence[str] | None = None) 
         else:
             rows += own
     figure = Figure(figsize=(WIDTH, 0.9 + 1.2 * len(rows)), layout="constrained")
-    panels = figure.subplots(len(rows), 2, sharex=True, squeeze=False)
-    for row, pair in zip(rows, panels):
+    columns = 3 if accelerations else 2
+    panels = figure.subplots(len(rows), columns, sharex=True, squeeze=False)
+    for row, own in zip(rows, panels):
         part = f"{row.part} " if row.part else ""
         name = f"{plain(wrapped(row.joint, LABEL_WIDTH))}\n{part}"
-        for axes, values, label, unit, size in zip(
-            pair, (row.positions, row.rates), (name, ""), (row.unit, f"{row.unit}/s"), row.sizes
-        ):
+        curves = [row.positions, row.rates]
+        if accelerations:
+            curves.append(run.accelerations[:, row.own])
+        for axes, values, label, per, size in zip(own, curves, (name, "", ""), PER_TIME, row.sizes):
             prepare(axes)
-            mark_times(axes, solution, labelled=False)
-            factor = linear_axis(axes, [values], label, unit, size=size, noise=noise(solution))
-            draw_lines(axes, run.t, dict(zip(row.names, values.T)), factor)
-    for axes, title in zip(panels[0], ("position", "rate")):
-        axes.set_title(title, loc="left", fontsize=FONT_SIZE + 0.5)
-    for axes in panels.flat:
-        legend(axes, beside=False)
-    for column in panels.T:
-        time_axis(solution, list(column))
-        figure.align_ylabels(list(column))
+            mark_times(axes, solution, labelled=False, abscissa=abscissa)
+            measured = f"{row.unit}{per}"
+            factor = linear_axis(axes, [values], label, measured, size=size, noise=noise(solution))
+            draw_lines(axes, abscissa.of(run), dict(zip(row.names, values.T)), factor)
+    title_columns(figure, panels, ("position", "rate", "acceleration"), abscissa)
     notes = marks_note(solution)
     if any(len(row.names) > 1 for row in rows):
         notes.append(SEVERAL_FREEDOMS_NOTE)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -11,6 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from srm_mbs._kernel.workspace import workspace
+from srm_mbs.dynamics.constraints.wrenches import Placements
+from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.point_motion import Place, given_point, point_name
 from srm_mbs.dynamics.scaling import coordinate_units
 from srm_mbs.errors import InputError
 from srm_mbs.model.anchors import Anchor, resolve_moving
@@ -44,11 +47,28 @@ HEIGHTS = (2.4, 6.0)
 """Smallest and largest height (inch) of a figure in a plane."""
 AXES = "xyz"
 VIEWS = ((0, 2, "from the front"), (1, 2, "from the right"), (0, 1, "from above"))
-Places = dict[str, tuple[int, pin.SE3]]
-"""Points by name: joint, and placement in it."""
+Places = dict[str, Place]
+"""Points by name."""
 
 
-def draw_path(solution: SimulationResult, points: Sequence[Anchor] | None = None) -> Figure:
+def moving_points(mechanism: Mechanism, points: Sequence[Anchor | str]) -> Places:
+    """The places of ``points`` of links that move, by the names that plots show.
+
+    Raises
+    ------
+    InputError
+        If one of them does not exist or lies on the ground, or there are none.
+    """
+    given: Any = points
+    if isinstance(points, Sequence) and not isinstance(points, str):
+        given = [given_point(mechanism, p, "points") if isinstance(p, str) else p for p in points]
+    placed = resolve_moving(mechanism.model, given, "points")
+    if not placed:
+        raise InputError("no points are given", element="points", remedy="Leave the option out")
+    return {point_name(point): place for point, place in zip(points, placed)}
+
+
+def draw_path(solution: SimulationResult, points: Sequence[Anchor | str] | None = None) -> Figure:
     """Paths of points, with equal axes, their starts and ends marked.
 
     One view if they lie in planes normal to an axis of the world, otherwise three views.
@@ -66,24 +86,12 @@ def draw_path(solution: SimulationResult, points: Sequence[Anchor] | None = None
     """
     mechanism = solution.mechanism
     run = read_smoothly(solution)
-    notes = []
+    notes: list[str] = []
     if points is None:
-        paths = _default_paths(solution, run)
-        if not paths:
-            raise InputError(
-                "no joint, closure or centre of mass of the mechanism moves along a path",
-                element="points",
-                remedy='Name points, for example points=[srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))]',
-            )
-        left = list(paths)[len(LINES) :]
-        paths = {name: paths[name] for name in list(paths)[: len(LINES)]}
-        if left:
-            notes.append(f"Left out: {some_of(left)}; points=[...], or --point, names others.")
+        places, notes = some_places(solution, run, len(LINES))
     else:
-        placed = resolve_moving(mechanism.model, points, "points")
-        if not placed:
-            raise InputError("no points are given", element="points", remedy="Leave the option out")
-        paths = _paths(run, {_name(point): place for point, place in zip(points, placed)})
+        places = moving_points(mechanism, points)
+    paths = _paths(run, places)
     together = np.concatenate(list(paths.values()))
     extents = np.array([max(np.ptp(path[:, k]) for path in paths.values()) for k in range(3)])
     flat = extents <= FLATNESS_TOLERANCE * max(extents.max(), SMALLEST_PATH)
@@ -98,26 +106,38 @@ def draw_path(solution: SimulationResult, points: Sequence[Anchor] | None = None
     return figure
 
 
-def _name(anchor: Anchor) -> str:
-    if not any(anchor.xyz):
-        return anchor.where
-    return f"{anchor.where} ({', '.join(f'{x:.4g}' for x in anchor.xyz)})"
-
-
 def _paths(run: SimulationResult, places: Places) -> dict[str, FloatArray]:
     """Positions (n, 3) m in the world of each point."""
     model = run.mechanism.model
-    data = workspace(model)
-    paths = {name: np.empty((len(run.t), 3)) for name in places}
-    for i, q in enumerate(run.q):
-        pin.forwardKinematics(model, data, q)
-        for name, (joint, placement) in places.items():
-            paths[name][i] = data.oMi[joint].act(placement.translation)
-    return paths
+    placed = Placements.at(model, workspace(model), run.q)
+    return {name: placed.of(*place)[1] for name, place in places.items()}
 
 
-def _default_paths(solution: SimulationResult, run: SimulationResult) -> dict[str, FloatArray]:
-    """Paths of the origins of joints, of the anchors of closures, or of centres of mass."""
+def some_places(
+    solution: SimulationResult, run: SimulationResult, most: int
+) -> tuple[Places, list[str]]:
+    """At most ``most`` of the places that are drawn by default, and a note on the others.
+
+    Raises
+    ------
+    InputError
+        If none moves.
+    """
+    places = default_places(solution, run)
+    if not places:
+        raise InputError(
+            "no joint, closure or centre of mass of the mechanism moves along a path",
+            element="points",
+            remedy='Name points, for example points=[srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))]',
+        )
+    left = list(places)[most:]
+    notes = [f"Left out: {some_of(left)}; points=[...], or --point, names others."] if left else []
+    return {name: places[name] for name in list(places)[:most]}, notes
+
+
+def default_places(solution: SimulationResult, run: SimulationResult) -> Places:
+    """The origins of joints and the anchors of closures that move, or else centres of mass; none
+    where nothing moves along a path."""
     mechanism = solution.mechanism
     model = mechanism.model
     places: Places = {
@@ -129,9 +149,9 @@ def _default_paths(solution: SimulationResult, run: SimulationResult) -> dict[st
             for joint, placement in ends[:1] if ends and ends[0][0] else ends[1:]:
                 places.setdefault(f"closure {loop.name}", (joint, placement))
     size = coordinate_units(mechanism, mechanism.q0, mechanism.v0).length
-    paths = _different(_paths(run, places), SMALLEST_PATH * size)
-    if paths:
-        return paths
+    found = _different(run, places, SMALLEST_PATH * size)
+    if found:
+        return found
     # One rotating body, or several about one point.
     centres = {}
     for name in mechanism.joint_names:
@@ -139,17 +159,17 @@ def _default_paths(solution: SimulationResult, run: SimulationResult) -> dict[st
         if inertia.mass > 0.0:
             place = (model.getJointId(name), pin.SE3(np.eye(3), inertia.lever))
             centres[f"centre of mass of the body at {name}"] = place
-    return _different(_paths(run, centres), SMALLEST_PATH * size)
+    return _different(run, centres, SMALLEST_PATH * size)
 
 
-def _different(paths: dict[str, FloatArray], least: float) -> dict[str, FloatArray]:
-    """Those of the ``paths`` with an extent above ``least`` (m), each point once."""
+def _different(run: SimulationResult, places: Places, least: float) -> Places:
+    """Those of the ``places`` whose path has an extent above ``least`` (m), each point once."""
     found: dict[str, FloatArray] = {}
-    for name, path in paths.items():
+    for name, path in _paths(run, places).items():
         moves = bool(np.ptp(path, axis=0).max() > least)
         if moves and all(np.abs(path - other).max() > least for other in found.values()):
             found[name] = path
-    return found
+    return {name: places[name] for name in found}
 
 
 def _in_plane(paths: dict[str, FloatArray], flat: BoolArray, together: FloatArray) -> Figure:

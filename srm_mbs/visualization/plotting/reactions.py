@@ -1,4 +1,4 @@
-"""Reactions of the closures, and the forces of couplings and drives, over time."""
+"""Reactions of closures and joints, and the forces of couplings and drives."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from srm_mbs.dynamics.constraints.wrenches import moved
 from srm_mbs.dynamics.scaling import is_angle
-from srm_mbs.errors import ControllerError, EvaluationError, InputError, known_names
+from srm_mbs.errors import InputError, known_names
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
     LINES,
+    Abscissa,
     Draw,
     Lines,
     draw_lines,
@@ -25,8 +27,8 @@ from srm_mbs.visualization.plotting.figure import (
     some_of,
     time_panels,
 )
-from srm_mbs.visualization.plotting.joints import checked_names
-from srm_mbs.visualization.plotting.sampling import read_smoothly
+from srm_mbs.visualization.plotting.joints import checked_names, chosen_joints
+from srm_mbs.visualization.plotting.sampling import read_forces
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,39 +47,46 @@ AXIS_RATIO = 1.6
 """End of an axis with cut peaks, over the percentile."""
 MAX_PANELS = 8
 """Most panels of multipliers that are drawn by default."""
+ROUNDING = 1e-9
+"""Part of the largest force, for moments times the scene diagonal, that is rounding."""
 JOINT_FORCES = ((True, "torque ", "N m"), (False, "force ", "N"))
 """Name and unit of a force on a joint, whose position is an angle or not."""
 
 
 def draw_reactions(
-    solution: SimulationResult, loops: Sequence[str] | None = None, rows: bool = False
+    solution: SimulationResult,
+    loops: Sequence[str] | None = None,
+    rows: bool = False,
+    joints: Sequence[str] | None = None,
+    x: str | None = None,
+    unit: str | None = None,
 ) -> Figure:
-    """Forces and moments in the closures, and the forces of couplings and drives.
+    """Forces and moments in the closures and joints, and the forces of couplings and drives.
+
+    Forces and moments that are rounding are left out.
 
     Parameters
     ----------
-    loops
-        Names of closures; by default those with the largest forces that fit in a panel, and a note
-        names the others.  Drives are drawn if no closure is named.
+    loops, joints
+        Names of closures and of joints; by default those with the largest forces that fit in a
+        panel, and a note names the others.  Where some are named, only these are drawn, and no
+        drives.
     rows
-        Draw the multipliers of the rows of each closure instead of the norms of force and moment.
+        Draw the multipliers of the rows of each closure instead of the norms of force and moment,
+        and no joints unless they are named.
+    x, unit
+        Joint on the horizontal axis instead of time, and its unit (:class:`.figure.Abscissa`).
 
     Raises
     ------
     InputError
-        If a closure does not exist, nothing has a reaction, or the run was loaded and had a
-        controller.
+        If a closure or joint does not exist, nothing carries a force, or the run was loaded and had
+        a controller.
     """
     mechanisms = [segment.mechanism for segment in solution.segments]
     found = {loop.name: loop for mechanism in mechanisms for loop in mechanism.loops}
     drives = any(mechanism.drives for mechanism in mechanisms)
-    if not found and not drives:
-        raise InputError(
-            f"the mechanism {solution.mechanism.name!r} has neither closures nor drives, and so no "
-            "reactions",
-            element="kind",
-            remedy='Draw another kind, for example "state" or "balance"',
-        )
+    everything = loops is None and joints is None
     if loops is not None:
         loops = checked_names(loops, "loops", 'Give for example loops=["pin"]')
         for name in loops:
@@ -87,66 +96,108 @@ def draw_reactions(
                     element="loops",
                     remedy=known_names(found),
                 )
-    run = _readable(solution)
-    draws, left = (_by_row if rows else _by_loop)(run, found, loops)
-    if drives and loops is None:
-        draws += _drives(run)
-    notes = [*marks_note(solution), *_indeterminate(solution, loops or list(found))]
-    if left:
+    if joints is not None:
+        joints = chosen_joints(solution.mechanism, joints)
+    abscissa = Abscissa(solution, x, unit)
+    run = read_forces(solution, lambda run: run.reactions, MAX_PIECES)
+    drawing = _Drawing(run, abscissa)
+    if everything or loops is not None:
+        (_by_row if rows else _by_loop)(drawing, found, loops)
+    if joints is not None or (everything and not rows):
+        _by_joint(drawing, joints)
+    if drives and everything:
+        _drives(drawing)
+    notes = marks_note(solution)
+    if undetermined := drawing.undetermined(solution):
         notes.append(
-            f"Left out: {some_of(left)}; loops=[...], or --loop, draws those that it names."
+            f"Equilibrium does not determine {some_of(undetermined)}: values of least norm."
         )
-    return time_panels(solution, draws, notes, height=1.9)
+    if drawing.left:
+        notes.append(
+            f"Left out: {some_of(drawing.left)}; loops=[...] and joints=[...], or --loop and "
+            "--joint, draw those that they name."
+        )
+    if drawing.rounding:
+        notes.append(f"Left out as rounding: {some_of(drawing.rounding)}.")
+    if not drawing.draws:
+        raise InputError(
+            "nothing in the run carries a force",
+            element="kind",
+            remedy='Draw another kind, for example "state"',
+        )
+    return time_panels(solution, drawing.draws, notes, height=1.9, abscissa=abscissa)
 
 
-def _readable(solution: SimulationResult) -> SimulationResult:
-    """The run at smooth times; without the end of a failed run if there are no forces there."""
-    run = read_smoothly(solution, MAX_PIECES)
-    try:
-        _ = run.reactions
-    except (ControllerError, EvaluationError) as error:
-        if solution.success:
-            raise
-        if len(run.t) < 2:
-            raise InputError(
-                f"the run has no reactions: {error}",
-                element="kind",
-                remedy='Draw another kind, for example "state"',
-            ) from error
-        run = solution.at(run.t[:-1])
-    return run
+class _Drawing:
+    """Panels of a figure, and what they leave out.
 
+    Parameters
+    ----------
+    run
+        The run at the times that are drawn.
+    abscissa
+        The horizontal axis.
 
-def _indeterminate(solution: SimulationResult, loops: Sequence[str]) -> list[str]:
-    own = [row for row in solution.indeterminate_reactions if row.rpartition(".")[0] in loops]
-    if not own:
-        return []
-    return [f"Equilibrium does not determine {some_of(own)}: values of least norm."]
+    Attributes
+    ----------
+    draws
+        The panels.
+    left, rounding
+        Names of what is left out because there is no room, and because it is rounding.
+    shown
+        Names of the closures and joints that are drawn.
+    """
+
+    def __init__(self, run: SimulationResult, abscissa: Abscissa) -> None:
+        self.run, self.abscissa = run, abscissa
+        self.draws: list[Draw] = []
+        self.left: list[str] = []
+        self.rounding: list[str] = []
+        self.shown: dict[str, None] = {}
+        everything = [*run.reactions.values(), *run.joint_reactions.values()]
+        self._force = max((largest_size(wrench[:, :3]) for wrench in everything), default=0.0)
+        self._length = run.mechanism.structure.units.length
+
+    def wrenches(
+        self, wrenches: Mapping[str, FloatArray], where: str, about: str, fitting: bool
+    ) -> None:
+        """Panels of the norms of forces and moments; only those that fit if ``fitting``."""
+        forces = {name: np.linalg.norm(wrench[:, :3], axis=1) for name, wrench in wrenches.items()}
+        if fitting:
+            order = sorted(forces, key=lambda name: -_percentile([forces[name]]))
+            self.left += [name for name in forces if name in order[len(LINES) :]]
+            forces = {name: own for name, own in forces.items() if name in order[: len(LINES)]}
+        moments = {name: np.linalg.norm(wrenches[name][:, 3:], axis=1) for name in forces}
+        self.shown |= dict.fromkeys(forces)
+        least = ROUNDING * self._force
+        for lines, what, unit, title, zero in (
+            (forces, "force ", "N", f"forces in the {where}", least),
+            (moments, "moment ", "N m", f"moments in the {where}, {about}", least * self._length),
+        ):
+            large = {name: own for name, own in lines.items() if largest_size(own) > zero}
+            self.rounding += [f"{what}in {name}" for name in lines if name not in large]
+            for part in in_panels(large):
+                self.panel(part, what, unit, title)
+
+    def undetermined(self, solution: SimulationResult) -> list[str]:
+        """Rows and components of what is drawn that equilibrium does not determine."""
+        given = (*solution.indeterminate_reactions, *solution.indeterminate_joint_reactions)
+        return [name for name in given if name.rpartition(".")[0] in self.shown]
+
+    def panel(self, lines: Lines, name: str, unit: str, title: str) -> None:
+        """A panel of ``lines`` in ``unit``, with the label ``name`` of its axis."""
+        self.draws.append(_panel(self.run, self.abscissa, lines, name, unit, title))
 
 
 def _by_loop(
-    run: SimulationResult, found: Mapping[str, LoopClosure], names: Sequence[str] | None
-) -> tuple[list[Draw], list[str]]:
+    drawing: _Drawing, found: Mapping[str, LoopClosure], names: Sequence[str] | None
+) -> None:
     """Norms of force and moment of closures, couplings by the force on their first joint."""
-    tied = [name for name in names or found if found[name].anchors]
-    forces = {name: np.linalg.norm(run.reactions[name][:, :3], axis=1) for name in tied}
-    left: list[str] = []
-    if names is None:
-        largest = sorted(tied, key=lambda name: -_percentile([forces[name]]))[: len(LINES)]
-        left = [name for name in tied if name not in largest]
-        forces = {name: own for name, own in forces.items() if name in largest}
-    moments = {
-        name: np.linalg.norm(run.reactions[name][:, 3:], axis=1)
-        for name in forces
-        if _takes_moments(found[name])
-    }
-    draws: list[Draw] = []
-    if forces:
-        draws.append(_panel(run, forces, "force ", "N", "forces in the closures"))
-    if moments:
-        title = "moments in the closures, about the origins of their anchors b"
-        draws.append(_panel(run, moments, "moment ", "N m", title))
+    run = drawing.run
+    tied = {name: _at_contact(run, found[name]) for name in names or found if found[name].anchors}
+    drawing.wrenches(tied, "closures", "about the origins of their anchors a", names is None)
     coupled = [name for name in names or found if not found[name].anchors]
+    drawing.shown |= dict.fromkeys(coupled)
     first = {name: found[name].rows.joint_rows[0].joints[0] for name in coupled}
     couplings = run.coupling_forces
     for turning, what, unit in JOINT_FORCES:
@@ -155,22 +206,28 @@ def _by_loop(
             for name, joint in first.items()
             if is_angle(run.mechanism.model, joint) == turning
         }
-        title = "couplings, on their first joints"
-        draws += [_panel(run, part, what, unit, title) for part in in_panels(lines)]
-    return draws, left
+        for part in in_panels(lines):
+            drawing.panel(part, what, unit, "couplings, on their first joints")
 
 
-def _takes_moments(loop: LoopClosure) -> bool:
-    """Whether its reaction has a moment about the origin of b, except that of the closure error."""
-    return bool(len(loop.rows.alignments)) or 0 < len(loop.rows.directions) < 3
+def _at_contact(run: SimulationResult, loop: LoopClosure) -> FloatArray:
+    """The reaction (n, 6) about the origin of a, at which the forces of all rows act."""
+    at_a, at_b = (run.motion_of(place).position for place in loop.resolve(run.mechanism.model))
+    return moved(run.reactions[loop.name], at_a - at_b)
+
+
+def _by_joint(drawing: _Drawing, names: Sequence[str] | None) -> None:
+    """Norms of force and moment of joints."""
+    reactions = drawing.run.joint_reactions
+    chosen = {name: reactions[name] for name in names or reactions}
+    drawing.wrenches(chosen, "joints", "about their origins", names is None)
 
 
 def _by_row(
-    run: SimulationResult, found: Mapping[str, LoopClosure], names: Sequence[str] | None
-) -> tuple[list[Draw], list[str]]:
+    drawing: _Drawing, found: Mapping[str, LoopClosure], names: Sequence[str] | None
+) -> None:
     """The multipliers of each closure, rows of one unit in a panel."""
-    draws: list[Draw] = []
-    left: list[str] = []
+    run, draws, left = drawing.run, drawing.draws, drawing.left
     for name in names or found:
         loop = found[name]
         panels = []
@@ -182,34 +239,35 @@ def _by_row(
             lines = {loop.rows.labels[i]: run.reaction_multipliers[name][:, i] for i in own}
             if lines:
                 title = f"multipliers of {plain(name)}"
-                panels.append(_panel(run, lines, "multiplier ", unit, title))
+                panels.append(_panel(run, drawing.abscissa, lines, "multiplier ", unit, title))
         if names is None and (left or (draws and len(draws) + len(panels) > MAX_PANELS)):
             left.append(name)
         else:
             draws += panels
-    return draws, left
+            drawing.shown[name] = None
 
 
-def _drives(run: SimulationResult) -> list[Draw]:
+def _drives(drawing: _Drawing) -> None:
+    run = drawing.run
     model = run.mechanism.model
     turning = {
         drive.name: drive.joint is not None and is_angle(model, drive.joint)
         for each in run.segments
         for drive in each.mechanism.drives
     }
-    draws = []
     for turns, what, unit in JOINT_FORCES:
         lines = {n: own for n, own in run.drive_forces.items() if turning[n] == turns}
         if lines:
-            draws.append(_panel(run, lines, what, unit, "drives"))
-    return draws
+            drawing.panel(lines, what, unit, "drives")
 
 
-def _panel(run: SimulationResult, lines: Lines, name: str, unit: str, title: str) -> Draw:
+def _panel(
+    run: SimulationResult, abscissa: Abscissa, lines: Lines, name: str, unit: str, title: str
+) -> Draw:
     """A panel of ``lines`` in ``unit``, with the label ``name`` of its axis."""
 
     def draw(axes: Axes) -> str:
-        mark_times(axes, run, labelled=False)
+        mark_times(axes, run, labelled=False, abscissa=abscissa)
         shown = list(lines.values())
         top = AXIS_RATIO * _percentile(shown)
         largest = max(map(largest_size, shown))
@@ -217,7 +275,7 @@ def _panel(run: SimulationResult, lines: Lines, name: str, unit: str, title: str
         if cut:
             shown = [np.clip(values, -top, top) for values in shown]
         factor = linear_axis(axes, shown, name, unit, size=0.0)
-        draw_lines(axes, run.t, lines, factor)
+        draw_lines(axes, abscissa.of(run), lines, factor)
         if not cut:
             return title
         low = min(float(np.nanmin(finite(values))) for values in shown)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.errors import ControllerError, EvaluationError, InputError
 from srm_mbs.simulation.dae_result import DaeResult
 from srm_mbs.simulation.result import SimulationResult
 
@@ -65,6 +69,33 @@ def read_smoothly(solution: SimulationResult, most: int = MAX_PIECES) -> Simulat
     if np.array_equal(times, solution.t):
         return solution  # keeps quantities that it has computed
     return solution.at(times)
+
+
+def read_forces(
+    solution: SimulationResult, read: Callable[[Any], Any], most: int = MAX_PIECES
+) -> SimulationResult:
+    """As :func:`read_smoothly`; without the end of a failed run if ``read``, which needs the
+    equations of motion, cannot be evaluated there.
+
+    Raises
+    ------
+    InputError
+        If there is nothing else.
+    """
+    run = read_smoothly(solution, most)
+    try:
+        read(run)
+    except (ControllerError, EvaluationError) as error:
+        if solution.success:
+            raise
+        if len(run.t) < 2:
+            raise InputError(
+                f"the run has no forces: {error}",
+                element="kind",
+                remedy='Draw another kind, for example "state"',
+            ) from error
+        run = solution.at(run.t[:-1])
+    return run
 
 
 def between(ends: FloatArray, steps: int, most: int = MAX_PIECES) -> FloatArray:

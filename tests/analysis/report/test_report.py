@@ -17,7 +17,7 @@ from PIL import Image
 
 import srm_mbs as srm
 from srm_mbs.analysis.report.report import report_page
-from srm_mbs.analysis.report.sections import pictures_data
+from srm_mbs.analysis.report.sections import pictures_data, run_data
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, make_picture
 from srm_mbs.visualization.animation.shapes import ANCHOR_COLOUR
@@ -220,7 +220,9 @@ def test_a_run_that_failed_has_a_page_that_says_so() -> None:
 
 def test_a_run_that_failed_at_its_start_has_a_page() -> None:
     def broken(t: float, q: Any, v: Any) -> list[float]:
-        raise ValueError("never")
+        if t > 0.0:
+            raise ValueError("never")
+        return [0.0] * 3
 
     failed = srm.simulate(load("four_bar"), 1.0, controller=broken)
     page = short_page(failed)
@@ -257,7 +259,8 @@ def test_tables_without_rows_and_headings_without_content_are_left_out() -> None
     )
     assert all(Page(page).tables)
     headings = re.findall("<h3>(.*?)</h3>", page)
-    assert headings == ["Joints", "Bodies", "Loops", "Settings", "Statistics", "Energy balance"]
+    run_headings = ["Settings", "Statistics", "Largest reactions"]
+    assert headings == ["Joints", "Bodies", "Loops", *run_headings, "Energy balance"]
 
 
 # --- the snapshot ---------------------------------------------------------------------------------
@@ -431,9 +434,23 @@ def test_a_picture_that_a_loaded_run_has_not_is_named_in_the_page(tmp_path: Path
     assert "Not drawn: the reactions of a loaded run with a controller" in sentence
 
 
-def test_pictures_of_closures_are_left_out_for_an_open_chain() -> None:
+def test_an_open_chain_has_pictures_of_the_reactions_of_its_joints() -> None:
     pendulum = srm.simulate(load("simple_pendulum"), 0.1)
-    assert pictures_data(pendulum, ["reactions", "sigma"]) == {"images": [], "missing": []}
+    found = pictures_data(pendulum, ["reactions", "sigma"])
+    assert len(found["images"]) == 1
+    assert found["missing"] == []
+
+
+def test_the_largest_reactions_are_listed_with_their_times(tmp_path: Path) -> None:
+    solution = srm.simulate(load("four_bar"), 1.0)
+    rows = {name: cells for name, *cells in run_data(solution)["reactions"]}
+    assert list(rows) == ["closure pin", "joint crank", "joint coupler", "joint rocker"]
+    sizes = np.linalg.norm(solution.joint_reactions["crank"][:, :3], axis=1)
+    assert rows["joint crank"][0] == f"{sizes.max():.4g}"
+    assert rows["joint crank"][1] == f"{solution.t[sizes.argmax()]:.4g}"
+    controlled = srm.simulate(load("four_bar"), 0.1, controller=lambda t, q, v: 0.0 * v)
+    controlled.save(tmp_path / "run.npz")
+    assert run_data(srm.load_solution(tmp_path / "run.npz"))["reactions"] == []
 
 
 @pytest.mark.stress

@@ -38,8 +38,12 @@ def at_state(
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
     """Wrenches (6,) and multipliers (rows,) of every loop at one state."""
     system = make_system(mechanism)
-    wrenches, multipliers = reactions_at(system, np.zeros(1), q[None], v[None])
-    return {k: w[0] for k, w in wrenches.items()}, {k: m[0] for k, m in multipliers.items()}
+    found = reactions_at(system, np.zeros(1), q[None], v[None])
+    wrenches, multipliers = (
+        {name: rows[0] for name, rows in table.items()}
+        for table in (found.closures, found.multipliers)
+    )
+    return wrenches, multipliers
 
 
 def jacobian(mechanism: srm.Mechanism, q: FloatArray) -> FloatArray:
@@ -294,7 +298,7 @@ def test_applied_forces_and_damping_enter_the_reactions() -> None:
     """The propped bar again: a torque at the hinge is taken by the hook; damping at rest is not."""
     mechanism = propped_bar(0.4)
     system = make_system(mechanism, lambda t, q, v: np.array([6.0 + t]))
-    pushed, _ = reactions_at(system, np.array([1.5]), mechanism.q0[None], mechanism.v0[None])
+    pushed = reactions_at(system, np.array([1.5]), mechanism.q0[None], mechanism.v0[None]).closures
     across = np.array([-np.sin(0.4), 0.0, np.cos(0.4)])
     expected = wrench(mechanism)[:3] + 7.5 / 1.5 * across
     assert_close(pushed["hook"][0], [*expected, 0, 0, 0], atol=1e-13)

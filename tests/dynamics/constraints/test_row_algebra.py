@@ -235,12 +235,12 @@ def test_ranks_of_many_coordinates_are_those_of_singular_values(
     A = ClosureGeometry(mechanism, mechanism.q0).normalised(q)
     b = A @ np.random.default_rng(5).standard_normal(A.shape[1])
     expected = np.linalg.svd(A, compute_uv=False)
-    assert A.shape[1] > ranks.ARPACK_ABOVE
+    assert A.shape[1] > ranks.SPARSE_ABOVE
     assert abs(ranks.singular_value(A, 80) / expected[79] - 1.0) < 1e-9
     assert abs(ranks.smallest_singular_value(A, 1e-12) / expected[79] - 1.0) < 1e-9
     null, solved = ranks.null_basis(A, 1e-7), ranks.rank_revealing_qr(A, 1e-7)
     x = ranks.min_norm_solution(A, b, 1e-10)
-    monkeypatch.setattr(ranks, "ARPACK_ABOVE", 10**6)
+    monkeypatch.setattr(ranks, "SPARSE_ABOVE", 10**6)
     known = ranks.null_basis(A, 1e-7)
     assert np.abs(null @ null.T - known @ known.T).max() < 1e-9
     assert np.abs(solved.null @ solved.null.T - known @ known.T).max() < 1e-9
@@ -260,7 +260,7 @@ def test_rows_that_depend_on_each_other_have_the_singular_values_of_all_of_them(
     A = rng.standard_normal((5, 9))
     A = np.concatenate([A, A[:2] + A[2:4]])
     expected = np.linalg.svd(A, compute_uv=False)[4]
-    for threshold in ("KERNEL_ABOVE", "ARPACK_ABOVE"):
+    for threshold in ("KERNEL_ABOVE", "SPARSE_ABOVE"):
         monkeypatch.setattr(ranks, threshold, 0)
     assert abs(ranks.smallest_singular_value(A, 1e-9) - expected) < 1e-13
     assert abs(ranks.singular_value(A, 5) - expected) < 1e-13
@@ -307,7 +307,7 @@ def test_the_kernel_decides_as_the_reference_does(
     assert found.mobility
     monkeypatch.setattr(workspaces, "LARGE", 0)
     monkeypatch.setattr(ranks, "KERNEL_ABOVE", 0)
-    monkeypatch.setattr(ranks, "ARPACK_ABOVE", 2)  # ARPACK needs three columns
+    monkeypatch.setattr(ranks, "SPARSE_ABOVE", 2)
     same_decisions(found, srm.load(name), 1e-9 if name == "bricard" else 1e-12)
 
 

@@ -141,6 +141,7 @@ class Joined:
 
     def __init__(self, first: srm.Solution, second: srm.Solution) -> None:
         self.first, self.second, self.at = first, second, float(first.t[-1])
+        self.observables = first.observables
         a, b = first.steps, second.steps
         names = ("rates", "corrections", "sigmas", "ranks", "error_ratios", "placements", "stiff")
         both = {name: np.concatenate([getattr(a, name), getattr(b, name)]) for name in names}

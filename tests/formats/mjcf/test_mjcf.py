@@ -11,6 +11,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.visualization.animation.shapes import visuals_of
 from tests.integration.kernel.test_kernel import agree
+from tests.support.backends import on_both
 from tests.support.lockstep import compare
 from tests.support.mjcf_files import (
     BODY,
@@ -59,6 +60,10 @@ THREE = TENDONS.replace(
     '<joint joint="d" coef="-2"/></fixed>',
     '<joint joint="d" coef="-2"/><joint joint="b" coef="0.7"/></fixed>',
 )
+CURVED = THREE.replace('polycoef="0.1 3"', 'polycoef="0.1 0.5 -0.3 0.2 -0.1"').replace(
+    '<tendon name="tied" tendon1="pair" polycoef="0.2"/>',
+    '<joint joint1="a" joint2="d" polycoef="0.2 0.4 0 0.7"/>',
+)
 CABLES = """<mujoco><worldbody>
   <body name="hub"><joint name="a" axis="0 1 0" ref="20" springdamper="0.3 0.7"/>
     <geom type="capsule" size="0.1 0.2" pos="0.3 0 0.1"/>
@@ -84,6 +89,7 @@ FILES = {
     "tree": TREE,
     "cables": CABLES,
     "three": THREE,
+    "curved": CURVED,
     "free": FREE,
     "tendons": TENDONS,
     "four_bar": FOUR_BAR,
@@ -103,7 +109,7 @@ def test_mass_matrix_and_forces_are_those_of_mujoco(name: str) -> None:
     check_dynamics(Twins(FILES[name]))
 
 
-@pytest.mark.parametrize("name", ["four_bar", "tendons", "three", "two_loops"])
+@pytest.mark.parametrize("name", ["four_bar", "tendons", "three", "curved", "two_loops"])
 def test_residuals_of_equality_constraints_are_those_of_mujoco(name: str) -> None:
     check_residuals(Twins(FILES[name]))
 
@@ -299,3 +305,50 @@ def test_euler_angles_turn_about_moving_and_fixed_axes_as_in_mujoco(sequence: st
     twins.put(np.zeros(1), np.zeros(1))
     ours, theirs = twins.body("one")
     np.testing.assert_allclose(ours.homogeneous, theirs.homogeneous, atol=1e-14)
+
+
+KNEE = """<mujoco><compiler angle="radian"/><worldbody>
+  <body name="thigh"><joint name="hip" axis="0 1 0" ref="0.2"/>
+    <geom type="capsule" size="0.05" fromto="0 0 0 0 0 -0.4"/>
+    <body name="sled" pos="0 0 -0.4"><joint name="shift" type="slide" axis="1 0 0"/>
+      <geom size="0.03" mass="0.1"/>
+      <body name="shank"><joint name="knee" axis="0 1 0" ref="0.1"/>
+        <geom type="capsule" size="0.04" fromto="0 0 0 0 0 -0.4"/></body></body></body>
+  </worldbody>
+  <equality><joint joint1="shift" joint2="knee" polycoef="0.01 0.08 -0.05 0.03 -0.02"/></equality>
+  </mujoco>"""
+
+
+@on_both
+def test_a_knee_that_slides_moves_as_the_constrained_equations_have_it(
+    backend: str, tmp_path: Path
+) -> None:
+    """With M, bias and the row of MuJoCo, the rate of the row by differences."""
+    mechanism = loaded(tmp_path, KNEE)
+    theirs = mujoco.MjModel.from_xml_string(KNEE)
+    theirs.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    state = mujoco.MjData(theirs)
+    start = srm.assemble(mechanism, v={"hip": 1.0, "knee": -3.0})
+    run = srm.simulate(mechanism, 1.0, q0=start.q, v0=start.v, rtol=1e-9, backend=backend)
+    assert mechanism.joint_names == ("hip", "shift", "knee")
+
+    def row(q: np.ndarray) -> np.ndarray:
+        state.qpos[:] = q
+        mujoco.mj_forward(theirs, state)
+        return np.array(state.efc_J.reshape(state.nefc, -1)[0])
+
+    step = 1e-4
+    for t in (0.2, 0.5, 0.9):
+        q, v = run(t)
+        acceleration = (run(t + step)[1] - run(t - step)[1]) / (2.0 * step)
+        q = q + theirs.qpos0
+        rate = (row(q + step * v) - row(q - step * v)) @ v / (2.0 * step)
+        J = row(q)[None]
+        state.qvel[:] = v
+        mujoco.mj_forward(theirs, state)
+        assert abs(state.efc_pos[0]) < 1e-12
+        M = np.zeros((3, 3))
+        mujoco.mj_fullM(theirs, state, M)
+        kkt = np.block([[M, J.T], [J, np.zeros((1, 1))]])
+        expected = np.linalg.solve(kkt, np.append(-state.qfrc_bias, -rate))[:3]
+        np.testing.assert_allclose(acceleration, expected, rtol=1e-5, atol=1e-5)

@@ -162,7 +162,6 @@ EQUALITIES = {
     "joint": '<joint joint1="x"/>',
     "no joint": "<joint/>",
     "same joint": '<joint joint1="j" joint2="j"/>',
-    "nonlinear": '<joint joint1="j" joint2="k" polycoef="0 1 2"/>',
     "active": '<weld body1="one" active="perhaps"/>',
 }
 
@@ -171,6 +170,7 @@ TENDON = '<tendon><fixed {}><joint joint="{}" coef="{}"/></fixed></tendon>'
 TENDONS = {
     "with dead zone": TENDON.format('stiffness="2" springlength="0 1"', "j", 1),
     "with friction": TENDON.format('frictionloss="2"', "j", 1),
+    "with armature": TENDON.format('armature="2"', "j", 1),
     "on no such joint": TENDON.format('stiffness="2"', "x", 1),
     "on no joint": TENDON.format('stiffness="2"', "j", 0),
 }

@@ -315,6 +315,8 @@ THREAD = (
             "<pose>0.1 0.2 0 0 0 0</pose>",
             f"<screw_thread_pitch>{-2.0 * np.pi / 50.0}</screw_thread_pitch>",
         ),
+        ("world", "wheel", "<pose>0 0.1 0 0 0 0</pose>", "<thread_pitch>50</thread_pitch>"),
+        ("wheel", "world", "<pose>0.1 0.2 0 0 0 0</pose>", "<thread_pitch>50</thread_pitch>"),
     ],
 )
 def test_a_screw_of_gazebo_goes_into_the_tree_and_what_held_its_child_is_cut(
@@ -336,6 +338,54 @@ def test_a_screw_of_gazebo_goes_into_the_tree_and_what_held_its_child_is_cut(
     track, expected = (run(2.0)[0][run.mechanism.joint("track").idx_q] for run in runs)
     assert expected > 1e-3
     assert track == pytest.approx(expected, rel=1e-8)
+
+
+def test_two_screws_of_gazebo_on_one_link_hold_one_link_each(tmp_path: Path) -> None:
+    """A spindle with threads of both hands, as a gripper has it: couplings of the joints are the
+    same."""
+    links = "".join(NUT_LINK.format(name) for name in ("base", "slide", "wheel", "second"))
+    other = (
+        '<joint name="other" type="prismatic"><parent link="base"/><child link="second"/>'
+        '<origin xyz="0.1 0.5 0"/><axis xyz="0 1 0"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/>{}</joint>'
+    )
+    threads = THREAD.format("base", "wheel", "", "<thread_pitch>50</thread_pitch>")
+    threads += THREAD.format("second", "wheel", "", "<thread_pitch>-50</thread_pitch>").replace(
+        '"thread"', '"left_thread"'
+    )
+    path = write(tmp_path, NUT.format(links=links, thread=other.format("") + threads))
+    mechanism = srm.load(path, gravity=(0.0, 9.0, 0.0))
+    assert mechanism.degrees_of_freedom == 1
+    assert sorted(loop.type for loop in mechanism.loops) == ["prismatic", "revolute"]
+    coupled = NUT.format(
+        links=links, thread=other.format('<mimic joint="spin" multiplier="-0.04"/>')
+    )
+    mimic = '<mimic joint="spin" multiplier="-0.02"/></joint><joint name="spin"'
+    reference = srm.load(
+        write(tmp_path, coupled.replace('</joint><joint name="spin"', mimic, 1), "coupled.urdf"),
+        gravity=(0.0, 9.0, 0.0),
+    )
+    runs = [srm.simulate(m, 2.0, rtol=1e-10) for m in (mechanism, reference)]
+    places = []
+    for run in runs:
+        model, data = run.mechanism.model, run.mechanism.model.createData()
+        pin.framesForwardKinematics(model, data, run(2.0)[0])
+        places.append(data.oMf[model.getFrameId("second")].translation)
+    assert abs(places[1][1] - 0.5) > 1e-3
+    np.testing.assert_allclose(places[0], places[1], atol=1e-9)
+
+
+def test_a_screw_of_gazebo_on_the_ground_needs_a_base_that_the_ground_holds(tmp_path: Path) -> None:
+    links = "".join(NUT_LINK.format(name) for name in ("base", "slide", "wheel"))
+    thread = THREAD.format("world", "wheel", "", "<thread_pitch>50</thread_pitch>")
+    path = write(tmp_path, NUT.format(links=links, thread=thread))
+    with pytest.raises(srm.InputError, match="a base that is not fixed"):
+        srm.load(path, base="floating")
+    described = tmp_path / "nut.toml"
+    described.write_text(f'format = 1\nurdf = "{path.name}"\nbase = "planar"\n')
+    with pytest.raises(srm.InputError, match="a base that is not fixed"):
+        srm.load(described)
+    assert srm.load(described, base="fixed").degrees_of_freedom == 1
 
 
 def relation(mechanism: srm.Mechanism, q: FloatArray) -> float:
@@ -624,9 +674,11 @@ FAULTS = {
         "revolute", "<axis><xyz>1 0 0</xyz><dynamics><friction>2</friction></dynamics></axis>"
     ),
     "gazebo screw without thread": gazebo("screw", "<axis><xyz>0 1 0</xyz></axis>"),
-    "gazebo screw on the ground": gazebo(
+    "gazebo screw between the ground and the root link": gazebo(
         "screw", "<axis><xyz>0 1 0</xyz></axis><thread_pitch>3</thread_pitch>"
-    ).replace("<parent>shin", "<parent>world"),
+    )
+    .replace("<parent>shin", "<parent>world")
+    .replace("<child>rim", "<child>base"),
     "gazebo screw of a name that is taken": gazebo("screw", "").replace('"ring"', '"hip"'),
     "gazebo joint with more": gazebo("ball", "<plugin/>"),
     "second joint with friction": second("revolute", '<dynamics friction="2"/>'),

@@ -20,6 +20,7 @@ from srm_mbs.integration.breakpoints import smooth_intervals
 from srm_mbs.integration.control.step_size import initial_step
 from srm_mbs.integration.dense_output import DenseOutput
 from srm_mbs.integration.kernel import backend as kernel
+from srm_mbs.integration.kernel.marshalling import state_struct
 from srm_mbs.integration.kernel.run import CompiledRun
 from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.integration.methods.base import ErrorNorm
@@ -333,7 +334,7 @@ def test_the_first_step_agrees(name: str) -> None:
             make_kernel_system(system),
             method,
             norm,
-            memory,
+            state_struct(memory),
             state,
             smooth_intervals(np.zeros(0), np.zeros(0), 0.2, 0.2 + span),
             t0=0.2,

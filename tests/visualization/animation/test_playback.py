@@ -420,9 +420,14 @@ def test_a_server_that_does_not_start_is_an_input_error(
     assert "export_html" in str(info.value)
 
 
+def without_a_step(t: float, q: Any, v: Any) -> Any:
+    """A controller whose forces are finite at the start alone."""
+    return np.full(3, np.nan if t > 0.0 else 0.0)
+
+
 def test_a_run_that_fails_at_once_is_shown_as_it_stood(tmp_path: Path) -> None:
     mechanism = load("four_bar")
-    solution = srm.simulate(mechanism, 1.0, controller=lambda t, q, v: np.full(3, np.nan))
+    solution = srm.simulate(mechanism, 1.0, controller=without_a_step)
     assert len(solution.t) == 1
     export_html(solution, tmp_path / "page.html")
     motion = sample_motion(solution, (1,), 60.0)
@@ -591,7 +596,7 @@ def test_the_picture_shows_the_coloured_bodies_on_a_light_background(page_and_ru
 def test_a_page_without_motion_shows_the_mechanism_and_no_slider(
     browser: Any, tmp_path: Path
 ) -> None:
-    solution = srm.simulate(load("four_bar"), 1.0, controller=lambda t, q, v: np.full(3, np.nan))
+    solution = srm.simulate(load("four_bar"), 1.0, controller=without_a_step)
     with exported(browser, tmp_path, solution) as page:
         assert page.locator("#bar").is_visible() is False
         assert len(assert_in_place(page, solution, 0.0)) == 4

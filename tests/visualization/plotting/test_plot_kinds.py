@@ -20,7 +20,7 @@ from srm_mbs.visualization.plotting import figure as style
 from tests.support.bundled import load
 from tests.support.commands import error_line, run
 from tests.support.daes import START_TWO, problem_two, solution_two
-from tests.support.mechanisms import floating_ring
+from tests.support.mechanisms import add_link, floating_ring
 from tests.support.snapshots import check_messages, refused
 from tests.visualization.plotting.test_plots import fails_at, legend, line, marked_times, titles
 
@@ -88,8 +88,6 @@ def test_every_kind_of_every_bundled_mechanism_is_drawn_without_warnings(
     monkeypatch.setattr(joints, "MAX_PORTRAITS", 1)
     solution = srm.simulate(load(name), 0.01)
     for kind in KINDS:
-        if kind == "reactions" and not solution.mechanism.constrained:
-            continue
         figure = solution.plot(kind=kind)
         if kind == "path":  # ticks, layout and glyphs are found while drawing, which is slow
             figure.draw_without_rendering()
@@ -117,10 +115,12 @@ def test_runs_of_several_segments_are_drawn_whole(kind: str, let_go: Solution) -
 def test_plots_that_cannot_be_drawn_are_refused(
     slider_crank: Solution, stewart: Solution, ring: Solution, dae: srm.DaeSolution, tmp_path: Path
 ) -> None:
-    chain = srm.simulate(load("pendulum_chain"), 0.1)
+    model = pin.Model()
+    model.gravity.linear = np.zeros(3)
+    add_link(model, 0, pin.JointModelFreeFlyer(), "body")
+    adrift = srm.simulate(srm.Mechanism(model), 0.1)
     failed = srm.simulate(load("four_bar"), 1.0, step=1.0)
     assert len(failed.t) == 1
-    powerless = srm.simulate(load("slider_crank"), 1.0, controller=fails_at(0.0))
     ground, coupler = srm.Anchor("world"), srm.Anchor("coupler")
     cases: dict[str, tuple[Any, dict[str, Any]]] = {
         "an unknown kind": (slider_crank, {"kind": "drift"}),
@@ -133,8 +133,17 @@ def test_plots_that_cannot_be_drawn_are_refused(
         "a portrait of six freedoms": (stewart, {"kind": "phase", "joints": ["platform"]}),
         "no joint with a portrait": (ring, {"kind": "phase"}),
         "an unknown closure": (slider_crank, {"kind": "reactions", "loops": ["pni"]}),
-        "reactions of an open chain": (chain, {"kind": "reactions"}),
-        "reactions of no step": (powerless, {"kind": "reactions"}),
+        "an unknown joint's reaction": (slider_crank, {"kind": "reactions", "joints": ["pin"]}),
+        "reactions of a body at rest": (adrift, {"kind": "reactions"}),
+        "an unknown joint as axis": (slider_crank, {"kind": "state", "x": "krank"}),
+        "a joint of six freedoms as axis": (stewart, {"kind": "state", "x": "platform"}),
+        "a unit without a joint": (slider_crank, {"kind": "state", "unit": "deg"}),
+        "a length of an angle": (slider_crank, {"kind": "state", "x": "crank", "unit": "mm"}),
+        "an axis of a run plot": (slider_crank, {"x": "crank"}),
+        "a size of one number": (slider_crank, {"size": 7.0}),
+        "a size of nothing": (slider_crank, {"size": (7.0, 0.0)}),
+        "a title that is no text": (slider_crank, {"title": 7}),
+        "an unknown point": (slider_crank, {"kind": "point", "points": ["C"]}),
         "one point": (slider_crank, {"kind": "path", "points": srm.Anchor("rod")}),
         "no points": (slider_crank, {"kind": "path", "points": []}),
         "an unknown link": (slider_crank, {"kind": "path", "points": [srm.Anchor("rood")]}),
@@ -299,22 +308,60 @@ def test_many_works_are_summed_and_none_is_lost() -> None:
 
 def test_reactions_are_the_norms_of_forces_and_moments(driven: Solution) -> None:
     figure = driven.plot(kind="reactions")
-    force, moment, drive = figure.axes
+    force, on_joints, turning, drive = figure.axes
     labels = [axes.get_ylabel() for axes in figure.axes]
-    assert labels == ["force (N)", "moment (N m)", "torque (N m)"]
+    assert labels == ["force (N)", "force (N)", "moment (N m)", "torque (N m)"]
     t, values = drawn(force)
     read = driven.at(t)
-    wrench = read.reactions["pin"]
-    np.testing.assert_allclose(values, np.linalg.norm(wrench[:, :3], axis=1))
-    np.testing.assert_allclose(drawn(moment)[1], np.linalg.norm(wrench[:, 3:], axis=1))
+    np.testing.assert_allclose(values, np.linalg.norm(read.reactions["pin"][:, :3], axis=1))
+    wrench = read.joint_reactions["crank"]
+    np.testing.assert_allclose(drawn(on_joints)[1], np.linalg.norm(wrench[:, :3], axis=1))
+    np.testing.assert_allclose(drawn(turning)[1], np.linalg.norm(wrench[:, 3:], axis=1))
     np.testing.assert_allclose(drawn(drive)[1], read.drive_forces["crank"])
-    assert [legend(axes) for axes in figure.axes] == [["pin"], ["pin"], ["crank"]]
+    shown = [legend(axes) for axes in figure.axes]
+    assert shown == [["pin"], ["crank", "rod"], ["crank"], ["crank"]]
+    assert "Left out as rounding: moment in pin, moment in rod." in note(figure)
+
+
+def test_moments_of_a_contact_are_about_the_point_that_touches() -> None:
+    """A ball on a plane: its force has a moment about the origin of the plane, none about the
+    ball."""
+    solution = srm.simulate(load("slider_crank"), 0.3)
+    assert np.abs(solution.reactions["pin"][:, 3:]).max() > 1.0
+    figure = solution.plot(kind="reactions", loops=["pin"])
+    assert titles(figure) == ["(a) forces in the closures"]
+    assert "Left out as rounding: moment in pin." in note(figure)
+
+
+def test_joints_that_are_named_are_drawn_alone_over_any_joint() -> None:
+    solution = srm.simulate(load("four_bar"), 0.5)
+    figure = solution.plot(kind="reactions", joints=["rocker"], x="crank", unit="deg")
+    assert [legend(axes) for axes in figure.axes] == [["rocker"]] * len(figure.axes)
+    assert figure.axes[-1].get_xlabel() == "crank (deg)"
+    angle, values = drawn(figure.axes[0])
+    found = np.linalg.norm(solution.joint_reactions["rocker"][:, :3], axis=1)
+    crank = np.rad2deg(solution.joint("crank")[0])
+    assert angle[0] == pytest.approx(crank[0])
+    assert angle[-1] == pytest.approx(crank[-1])
+    assert values[-1] == pytest.approx(found[-1])
+
+
+def test_an_open_chain_has_reactions_in_its_joints() -> None:
+    solution = srm.simulate(load("pendulum_chain"), 0.1)
+    figure = solution.plot(kind="reactions")
+    assert titles(figure)[0] == "(a) forces in the joints"
+    t, values = drawn(figure.axes[0])
+    first = solution.mechanism.joint_names[0]
+    expected = np.linalg.norm(solution.at(t).joint_reactions[first][:, :3], axis=1)
+    np.testing.assert_allclose(values, expected)
 
 
 def test_pins_have_no_moments_and_name_what_equilibrium_does_not_determine() -> None:
     solution = srm.simulate(load("four_bar"), 0.2)
     figure = solution.plot(kind="reactions")
-    assert titles(figure) == ["(a) forces in the closures"]
+    assert titles(figure) == ["(a) forces in the closures", "(b) forces in the joints"]
+    assert "Equilibrium does not determine pin.y, crank.fy, crank.mx" in note(figure)
+    figure = solution.plot(kind="reactions", loops=["pin"])
     assert "Equilibrium does not determine pin.y: values of least norm." in note(figure)
 
 
@@ -335,7 +382,8 @@ def test_rows_of_one_unit_share_a_panel() -> None:
 
 def test_couplings_are_drawn_by_the_force_on_their_first_joints() -> None:
     solution = srm.simulate(load("differential"), 0.2)
-    (axes,) = solution.plot(kind="reactions").axes
+    couplings = [loop.name for loop in solution.mechanism.loops]
+    (axes,) = solution.plot(kind="reactions", loops=couplings).axes
     t, values = drawn(axes)
     assert legend(axes)[0].replace("\n", " ") == "final_drive, on pinion"
     np.testing.assert_allclose(values, solution.at(t).coupling_forces["final_drive"][:, 0])
@@ -368,6 +416,51 @@ def test_peaks_beside_singular_passages_are_cut_and_said(monkeypatch: pytest.Mon
     assert titles(figure)[0].endswith(f"peaks to {force.max():.2g} N are cut")
     assert figure.axes[0].get_ylim()[1] < force.max() / 10.0
     assert drawn(figure.axes[0])[1].max() == force.max()
+
+
+# -- points, axes, titles ---------------------------------------------------------------------
+
+
+def test_points_have_positions_velocities_and_accelerations_over_a_joint(
+    slider_crank: Solution,
+) -> None:
+    middle = srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))
+    figure = slider_crank.plot(kind="point", points=[middle], x="crank", unit="deg")
+    assert [axes.get_ylabel().rpartition("(")[2] for axes in figure.axes] == ["m)", "m/s)", "m/s²)"]
+    assert titles(figure) == ["position", "velocity", "acceleration"]
+    assert legend(figure.axes[0]) == ["x", "z"]
+    motion = slider_crank.point(middle)
+    crank = np.rad2deg(slider_crank.joint("crank")[0])
+    for axes, values in zip(figure.axes, (motion.position, motion.velocity, motion.acceleration)):
+        assert axes.get_xlabel() == "crank (deg)"
+        for drawn_line, k in zip(axes.lines, (0, 2)):
+            angle, shown = drawn_line.get_data()
+            assert angle[-1] == pytest.approx(crank[-1])
+            assert shown[-1] == pytest.approx(values[-1, k], rel=1e-9)
+    assert "coordinates that do not change are left out" in note(figure)
+
+
+def test_accelerations_are_a_third_column_of_the_state(slider_crank: Solution) -> None:
+    figure = slider_crank.plot(kind="state", joints=["rod"], accelerations=True)
+    assert titles(figure) == ["position", "rate", "acceleration"]
+    t, values = drawn(figure.axes[2])
+    np.testing.assert_allclose(values, slider_crank.at(t).accelerations[:, 1])
+    assert figure.axes[2].get_ylabel() == "(rad/s²)"
+
+
+def test_passages_are_marked_at_the_position_of_the_joint(slider_crank: Solution) -> None:
+    crossings = slider_crank.crossings
+    assert crossings
+    figure = slider_crank.plot(kind="state", joints=["rod"], x="crank")
+    expected = slider_crank.at([crossing.time for crossing in crossings]).joint("crank")[0]
+    np.testing.assert_allclose(sorted(marked_times(figure.axes[0])), sorted(expected))
+
+
+def test_titles_and_sizes_may_be_chosen(slider_crank: Solution, dae: srm.DaeSolution) -> None:
+    for solution in (slider_crank, dae):
+        figure = solution.plot(title="Test $1", size=(8.0, 3.5))
+        assert figure.get_suptitle() == "Test $1"
+        assert figure.get_size_inches().tolist() == [8.0, 3.5]
 
 
 # -- sigma ------------------------------------------------------------------------------------
@@ -527,7 +620,7 @@ def test_lines_of_a_panel_differ_in_more_than_colour() -> None:
 def test_a_legend_that_does_not_fit_above_stands_beside(walker: Solution) -> None:
     figure = walker.plot(kind="reactions")
     figure.draw_without_rendering()
-    (axes,) = figure.axes
+    axes = figure.axes[0]
     assert axes.get_legend().get_window_extent().x0 >= axes.bbox.x1
 
 
@@ -614,6 +707,9 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("--kind", "reactions", "--loop", "pin", "--rows"),
         ("--kind", "path", "--point", "rod:1,0,0"),
         ("--kind", "phase", "--joint", "rod"),
+        ("--kind", "point", "--point", "rod:1,0,0", "--title", "A point", "--size", "8,6"),
+        ("--kind", "state", "--x", "crank", "--unit", "deg", "--accelerations"),
+        ("--kind", "reactions", "--joint", "crank", "--joint", "rod"),
     ],
 )
 def test_the_command_plot_draws_other_kinds_beside_the_run(
@@ -633,6 +729,11 @@ def test_the_command_plot_draws_other_kinds_beside_the_run(
         (("--kind", "path", "--point", "rod"), "--point"),
         (("--kind", "path", "--point", "rd:0,0,0"), "--point"),
         (("--kind", "reactions", "--loop", "x"), "--loop"),
+        (("--kind", "reactions", "--joint", "x"), "--joint"),
+        (("--kind", "point", "--point", "C"), "--point"),
+        (("--kind", "state", "--x", "C"), "--x"),
+        (("--kind", "state", "--x", "crank", "--unit", "m"), "--unit"),
+        (("--size", "7"), "--size"),
     ],
 )
 def test_the_command_plot_names_its_own_options(
@@ -652,7 +753,7 @@ def test_a_loaded_run_with_a_controller_is_drawn_but_for_what_needs_it(tmp_path:
     srm.simulate(mechanism, 0.2, controller=lambda t, q, v: [np.sin(t), 0.0]).save(path)
     solution = srm.load_solution(path)
     for kind in KINDS:
-        if kind not in ("balance", "reactions"):
+        if kind not in ("balance", "reactions", "point"):
             solution.plot(kind=kind)
             continue
         with pytest.raises(srm.InputError, match="controllers are not saved"):

@@ -1,0 +1,108 @@
+"""What the analysis of a run costs beside the run: passages, certificate, balance, reactions.
+
+    python -m benchmarks.certificate_cost [--models NAME ...] [--seconds 10] [--repeats 5]
+
+Run from a checkout with the compiled kernel; BLAS runs on one thread.  CPU times of the process in
+milliseconds, medians of the repeats, each on a fresh run.  ``certify`` is without its two reruns,
+and includes the passages and the balance where it reads them.  ``n_four_bar_N`` is
+``srm.n_four_bar(N)``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+from unittest import mock
+
+import srm_mbs as srm
+from srm_mbs.analysis.accuracy import error_estimate
+
+MODELS = (
+    "stewart_platform",
+    "jansen_walker",
+    "slider_crank",
+    "four_bar",
+    "n_four_bar_2",
+    "n_four_bar_40",
+    "n_four_bar_80",
+    "delta_robot",
+    "bricard",
+    "parallelogram",
+)
+COUNTED = "n_four_bar_"
+
+
+def mechanism_of(name: str) -> srm.Mechanism:
+    """A bundled mechanism, or the N-four-bar ``n_four_bar_N``."""
+    if name.startswith(COUNTED):
+        return srm.n_four_bar(int(name.removeprefix(COUNTED)))
+    return srm.load(name)
+
+
+def spent(work: Callable[[], Any]) -> float:
+    """CPU time (ms) of a piece of work."""
+    start = time.process_time()
+    work()
+    return 1e3 * (time.process_time() - start)
+
+
+def certified(run: srm.Solution) -> float:
+    """CPU time (ms) of ``certify`` without that of its reruns."""
+    reruns = 0.0
+    rerun = error_estimate.rerun
+
+    def timed(*args: Any, **options: Any) -> Any:
+        nonlocal reruns
+        start = time.process_time()
+        try:
+            return rerun(*args, **options)
+        finally:
+            reruns += 1e3 * (time.process_time() - start)
+
+    with mock.patch.object(error_estimate, "rerun", timed):
+        whole = spent(lambda: srm.certify(run))
+    return whole - reruns
+
+
+READINGS: dict[str, Callable[[srm.Solution], Any]] = {
+    "crossings": lambda run: run.crossings,
+    "energy": lambda run: run.energy,
+    "balance": lambda run: run.energy_balance,
+    "drift": lambda run: run.drift,
+    "reactions": lambda run: run.reactions,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, usage=argparse.SUPPRESS)
+    parser.add_argument("--models", nargs="+", default=list(MODELS))
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args()
+    heads = ("run", "certify", *READINGS, "mobility")
+    print(f"{'ms':18s} steps passages" + "".join(f"{head:>10s}" for head in heads))
+    for name in options.models:
+        mechanism = mechanism_of(name)
+
+        def run(mechanism: srm.Mechanism = mechanism) -> srm.Solution:
+            return srm.simulate(mechanism, options.seconds)
+
+        run()  # what is imported and made once
+        rows: dict[str, list[float]] = {head: [] for head in heads}
+        for _ in range(options.repeats):
+            start = time.process_time()
+            whole = run()
+            rows["run"].append(1e3 * (time.process_time() - start))
+            rows["certify"].append(certified(run()))
+            for head, reading in READINGS.items():
+                rows[head].append(spent(lambda: reading(whole)))  # noqa: B023
+            rows["mobility"].append(spent(lambda: srm.mobility_map(whole)))  # noqa: B023
+        numbers = "".join(f"{statistics.median(rows[head]):10.2f}" for head in heads)
+        print(f"{name:18s} {whole.stats.steps:5d} {len(whole.crossings):8d}{numbers}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,127 @@
+"""Quantities at many states of a mechanism: closure errors, rows of G, energies, powers of forces.
+
+:class:`Observables` is the reference; the compiled kernel has the same in
+:mod:`srm_mbs.integration.kernel.observables`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rheonomic import all_rows, constraint_errors
+from srm_mbs.dynamics.forces import ForceKinematics
+from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
+from srm_mbs.model.forces import Bushing, ForceElement, SpringDamper, TorsionSpring
+from srm_mbs.model.mechanism import MechanismData, per_model
+
+LINEAR = (SpringDamper, TorsionSpring, Bushing)
+"""Elements whose force is that of a stiffness and that of a damping."""
+
+
+def without_spring(force: ForceElement) -> ForceElement:
+    """The damper of a linear element; of another one the element itself."""
+    if not isinstance(force, LINEAR):
+        return force
+    none: Any = (0.0,) * 6 if isinstance(force, Bushing) else 0.0
+    return replace(force, stiffness=none)
+
+
+@per_model
+def working_elements(mechanism: MechanismData) -> dict[str, ForceKinematics]:
+    """The elements that do work beside that of a potential, by name, without their springs."""
+    return {
+        force.name: ForceKinematics(mechanism.model, [without_spring(force)])
+        for force in mechanism.forces
+        # An undamped spring does no other work.
+        if not force.has_potential or np.any(getattr(force, "damping", 1.0))
+    }
+
+
+@per_model
+def conservative_elements(mechanism: MechanismData) -> dict[str, ForceKinematics]:
+    """Those of them whose force at rest has a potential: its power is subtracted from theirs."""
+    return {
+        force.name: ForceKinematics(mechanism.model, [force])
+        for force in mechanism.forces
+        if force.name in working_elements(mechanism)
+        and force.has_potential
+        and not isinstance(force, LINEAR)
+    }
+
+
+class Observables:
+    """Quantities of the mechanism of ``system`` at n states.
+
+    Times t (n,) are in s, configurations q (n, nq), velocities v (n, nv).
+    """
+
+    def __init__(self, system: OpenSystem | ClosedSystem) -> None:
+        self.system = system
+        self.mechanism = system.mechanism
+
+    def closure_errors(
+        self, t: FloatArray, q: FloatArray, v: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """g - s (n, rows) in m and rad, and G v - s' (n, rows), of all rows."""
+        return constraint_errors(self.mechanism, t, q, v)
+
+    def jacobians(self, t: FloatArray, q: FloatArray) -> FloatArray:
+        """G (n, rows, nv) of all rows; with drives [G, -s'] (n, rows, nv + 1)."""
+        mechanism = self.mechanism
+        rows, data = all_rows(mechanism), workspace(mechanism.model)
+        width = mechanism.model.nv + bool(mechanism.drives)
+        out = np.empty((len(q), len(rows.g), width))
+        for i in range(len(q)):
+            rows.evaluate(mechanism.model, data, q[i])
+            rows.move_to(t[i])
+            out[i, :, : mechanism.model.nv] = rows.G
+            if mechanism.drives:
+                out[i, :, -1] = -rows.target_rate
+        return out
+
+    def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
+        """Kinetic and potential energy (n, 2) J: of the bodies; of gravity, springs and
+        bushings."""
+        system = self.system
+        out = np.empty((len(q), 2))
+        for i, state in enumerate(zip(q, v)):
+            kinetic = system.kinetic_energy(*state)
+            out[i] = kinetic, system.energy(np.concatenate(state)) - kinetic
+        return out
+
+    def powers(self, t: FloatArray, q: FloatArray, v: FloatArray) -> dict[str, FloatArray]:
+        """Power (n,) W of each force element but that of its potential, by name.
+
+        Raises
+        ------
+        EvaluationError
+            If a force cannot be evaluated.
+        """
+        powers = self._powers(working_elements(self.mechanism), t, q, v)
+        at_rest = self._powers(conservative_elements(self.mechanism), t, q, v, resting=True)
+        return {name: power - at_rest.get(name, 0.0) for name, power in powers.items()}
+
+    def _powers(
+        self,
+        elements: dict[str, ForceKinematics],
+        t: FloatArray,
+        q: FloatArray,
+        v: FloatArray,
+        resting: bool = False,
+    ) -> dict[str, FloatArray]:
+        """Power (n,) of each of ``elements``, or of its force at rest."""
+        model, data = self.mechanism.model, workspace(self.mechanism.model)
+        powers = {name: np.empty(len(t)) for name in elements}
+        for i, (time, position, rate) in enumerate(zip(t, q, v) if elements else ()):
+            acting = np.zeros(model.nv) if resting else rate
+            pin.computeJointJacobians(model, data, position)
+            pin.forwardKinematics(model, data, position, acting)
+            for name, element in elements.items():
+                powers[name][i] = element.generalised(data, position, acting, time) @ rate
+        return powers

@@ -1,0 +1,1 @@
+"""Planar linkages, by points and bars."""

@@ -1,0 +1,315 @@
+"""The drawing of a planar linkage: its points and bars in one pose, checked and in SI units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from functools import cached_property
+from itertools import combinations, pairwise
+from typing import Any
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.errors import InputError, known_names, naming
+from srm_mbs.formats.files import check_name
+from srm_mbs.formats.graph.joint_graph import ROOT_JOINT
+from srm_mbs.formats.planar.shapes import direction_angle, fitted, own_axes, turned
+from srm_mbs.formats.toml.schema import LENGTH_UNITS, PlanarBar, PlanarEntry, PlanarSlider
+from srm_mbs.model.anchors import WORLD
+
+RESERVED = (WORLD, "universe", ROOT_JOINT)
+"""Names of the ground, of Pinocchio's first frame, and of the joint of a base."""
+MOST_PARTS = 2000
+"""Points, bars and sliders of a linkage: the analysis of larger ones takes minutes."""
+SIZES = (1e-9, 1e9)
+"""Sizes of a drawing (m), and lengths over the size; others are of another unit, or a mistake."""
+COINCIDENT = 1e-9
+"""Distance of two points, over the size of the drawing, at which they are the same."""
+
+
+def fault(element: str, problem: str, remedy: str) -> InputError:
+    """The error about one element of the drawing."""
+    return InputError(problem, element=element, remedy=remedy)
+
+
+class Drawing:
+    """The points of a linkage, and where the bodies that they lie on have them.
+
+    Parameters
+    ----------
+    entry
+        The section ``[planar]``.
+
+    Attributes
+    ----------
+    unit, angle
+        Factors to m and rad.
+    points
+        Positions (2,) in m as drawn, by name.
+    bars, sliders
+        By name.
+    ground
+        Names of the points on the ground.
+    bodies
+        Names of the ground, the bars and the sliders that have mass, in this order.
+
+    Raises
+    ------
+    InputError
+        Naming the point, bar or slider that cannot be.
+    """
+
+    def __init__(self, entry: PlanarEntry) -> None:
+        self.entry = entry
+        self.unit = LENGTH_UNITS[entry.unit]
+        self.angle = math.radians(1.0) if entry.angle == "deg" else 1.0
+        self.points = {name: self.unit * np.array(at) for name, at in entry.points.items()}
+        self.ground = tuple(entry.ground)
+        self._check_names()
+        self.bars: dict[str, PlanarBar] = {bar.name: bar for bar in entry.bar}
+        self.sliders: dict[str, PlanarSlider] = {each.name: each for each in entry.slider}
+        self.bodies = (WORLD, *self.bars, *(s.name for s in entry.slider if s.mass))
+        self._check_ground()
+        for bar in entry.bar:
+            self._check_bar(bar)
+        for slider in entry.slider:
+            self.point(slider.point, f"slider {slider.name!r}")
+        for slider in entry.slider:
+            self._check_slider(slider)
+        self._check_use()
+        self._check_lengths()
+        self._shapes = {name: self._shape(bar) for name, bar in self.bars.items()}
+
+    # -- checks ------------------------------------------------------------------------------
+
+    def _check_names(self) -> None:
+        known: set[str] = set()
+        named = [("bar", bar.name) for bar in self.entry.bar]
+        named += [("slider", slider.name) for slider in self.entry.slider]
+        for kind, name in (*(("point", name) for name in self.points), *named):
+            element = f"{kind} {name!r}"
+            check_name(name, kind)
+            if not name or ":" in name:
+                raise fault(element, "a name has characters, and no colon", "Give another name")
+            if name in RESERVED:
+                raise fault(element, f"the name {name!r} is reserved", "Rename it")
+            if kind == "point":
+                continue
+            if name in known:
+                raise fault(element, "the name is used twice", "Give every part its own name")
+            known.add(name)
+        if len(self.points) + len(named) > MOST_PARTS:
+            raise fault(
+                "planar",
+                f"the linkage has more than {MOST_PARTS} points, bars and sliders",
+                "Give fewer",
+            )
+        if self.points and not SIZES[0] <= self.size <= SIZES[1]:
+            raise fault(
+                "points", f"the drawing measures {self.size:g} m", "Correct the points, or the unit"
+            )
+        if not named:
+            raise fault("planar", "the linkage has no bar", "Give bars, each with its points")
+
+    def point(self, name: str, element: str) -> FloatArray:
+        """Position (2,) of a point in m as drawn; errors are about ``element``."""
+        if name not in self.points:
+            raise fault(element, f"there is no point {name!r}", known_names(self.points))
+        return self.points[name]
+
+    @cached_property
+    def size(self) -> float:
+        """Diagonal (m) of the drawing."""
+        return float(np.linalg.norm(np.ptp(np.array(list(self.points.values())), axis=0)))
+
+    def _check_ground(self) -> None:
+        if not self.ground and all(slider.on for slider in self.entry.slider):
+            raise fault("ground", "no point is on the ground", "Name the points that stay in place")
+        for name in self.ground:
+            self.point(name, "ground")
+            if self.ground.count(name) > 1:
+                raise fault("ground", f"point {name!r} is named twice", "Name it once")
+
+    def _check_bar(self, bar: PlanarBar) -> None:
+        element = f"bar {bar.name!r}"
+        if len(bar.points) < 2:
+            raise fault(element, f"it has {len(bar.points)} points", "Give two points or more")
+        for name in bar.points:
+            self.point(name, element)
+            if bar.points.count(name) > 1:
+                raise fault(element, f"point {name!r} is named twice", "Name it once")
+        for a, b in combinations(bar.points, 2):
+            if np.linalg.norm(self.points[a] - self.points[b]) <= COINCIDENT * self.size:
+                raise fault(
+                    element, f"the points {a!r} and {b!r} coincide", "Move one of them, or use one"
+                )
+        fixed = [name for name in bar.points if name in self.ground]
+        if len(fixed) > 1:
+            names = " and ".join(map(repr, fixed))
+            raise fault(
+                element,
+                f"its points {names} are on the ground: it cannot move",
+                "Remove the bar, or one of the points from ground",
+            )
+        if bar.mass is None and bar.mass_per_length is None and self.entry.mass_per_length is None:
+            raise fault(element, "it has no mass", "Give mass_per_length (kg/m), or its mass (kg)")
+        if bar.mass is not None and bar.mass_per_length is not None:
+            raise fault(element, "mass and mass_per_length are given", "Give one of them")
+        if bar.length is not None and not (
+            SIZES[0] * self.size <= self.unit * bar.length <= SIZES[1] * self.size
+        ):
+            raise fault(
+                element, f"the length {bar.length:g} does not fit the drawing", "Correct it"
+            )
+        if bar.length is not None and len(bar.points) != 2:
+            raise fault(
+                element,
+                f"one length does not determine a bar of {len(bar.points)} points",
+                'Give the lengths between pairs of its points: lengths={("A", "B"): ...} in '
+                "Python, [[planar.length]] in TOML",
+            )
+
+    def _check_slider(self, slider: PlanarSlider) -> None:
+        element = f"slider {slider.name!r}"
+        if slider.on and slider.on not in self.bars:
+            raise fault(element, f"there is no bar {slider.on!r}", known_names(self.bars))
+        on = self.bars[slider.on].points if slider.on else self.ground
+        if slider.point in on:
+            where = f"bar {slider.on!r}" if slider.on else "the ground"
+            raise fault(
+                element,
+                f"its point {slider.point!r} is fixed on {where}, on which it slides",
+                "Let it slide on another bar, or give it another point",
+            )
+        others = [name for name in self.carriers(slider.point) if name != slider.name]
+        if not others and not slider.mass:
+            raise fault(
+                element,
+                f"nothing moves with it: no bar has the point {slider.point!r}",
+                "Give it a mass, or a bar with this point",
+            )
+        self.direction(slider)
+
+    def _check_use(self) -> None:
+        used = {name for bar in self.entry.bar for name in bar.points}
+        used |= {slider.point for slider in self.entry.slider}
+        used |= {name for spring in self.entry.spring for name in (spring.a, spring.b)}
+        for name in self.points:
+            if name not in used:
+                raise fault(
+                    f"point {name!r}", "nothing uses it", "Give it to a bar, or remove the point"
+                )
+
+    # -- geometry ----------------------------------------------------------------------------
+
+    def carriers(self, point: str) -> list[str]:
+        """The bodies that have a point: the ground, bars, and sliders with mass."""
+        return list(self._carriers[point])
+
+    @cached_property
+    def _carriers(self) -> dict[str, list[str]]:
+        found: dict[str, list[str]] = {name: [] for name in self.points}
+        for name in self.ground:
+            found[name].append(WORLD)
+        for bar in self.entry.bar:
+            for name in bar.points:
+                found[name].append(bar.name)
+        for slider in self.entry.slider:
+            if slider.mass:
+                found[slider.point].append(slider.name)
+        return found
+
+    def coinciding(self) -> list[tuple[str, str]]:
+        """Pairs of different points at one place of the drawing."""
+        order = sorted(self.points, key=lambda name: tuple(self.points[name]))
+        return [
+            (a, b)
+            for a, b in pairwise(order)
+            if np.linalg.norm(self.points[a] - self.points[b]) <= COINCIDENT * self.size
+        ]
+
+    def direction(self, slider: PlanarSlider) -> float:
+        """Angle (rad) of the line of a slider against x as drawn."""
+        element = f"slider {slider.name!r}"
+        along: Any = slider.along
+        if not isinstance(along, list):
+            return self.angle * float(along)
+        if all(isinstance(part, str) for part in along):
+            vector = self.point(along[1], element) - self.point(along[0], element)
+        else:
+            vector = np.array(along, dtype=float)
+        if not np.linalg.norm(vector):
+            raise fault(element, "its line has no direction", "Give a direction that is not zero")
+        return direction_angle(vector)
+
+    def begin(self, bar: str, point: str) -> None:
+        """Let a bar begin at one of its points."""
+        points = self.bars[bar].points
+        others = [name for name in points if name != point]
+        self.bars[bar] = self.bars[bar].model_copy(update={"points": [point, *others]})
+        self._shapes[bar] = self._shape(self.bars[bar])
+
+    def body_angle(self, body: str) -> float:
+        """Angle (rad) of the x axis of a body as drawn: of a bar, from the first to the second of
+        its points; of a slider, that of the bar on which it slides."""
+        if body in self.bars:
+            first, second = self.bars[body].points[:2]
+            return direction_angle(self.points[second] - self.points[first])
+        on = self.sliders[body].on if body in self.sliders else ""
+        return self.body_angle(on) if on else 0.0
+
+    def _lengths(self, bar: PlanarBar) -> dict[tuple[int, int], float]:
+        """The given lengths (m) between points of a bar, by their indices in it."""
+        out = {} if bar.length is None else {(0, 1): self.unit * bar.length}
+        for each in self.entry.length:
+            if set(each.between) <= set(bar.points):
+                i, j = sorted(map(bar.points.index, each.between))
+                out[i, j] = self.unit * each.length
+        return out
+
+    def _shape(self, bar: PlanarBar) -> FloatArray:
+        """The points (n, 2) of a bar in its own axes."""
+        drawn = np.array([self.points[name] for name in bar.points])
+        given = self._lengths(bar)
+        if len(drawn) == 2:
+            length = given.get((0, 1), float(np.linalg.norm(drawn[1] - drawn[0])))
+            return np.array([[0.0, 0.0], [length, 0.0]])
+        with naming(element=f"bar {bar.name!r}"):
+            return own_axes(fitted(drawn, given) if given else drawn)
+
+    def _check_lengths(self) -> None:
+        """Refuse lengths between points that no bar has, and of another order than the drawing."""
+        for each in self.entry.length:
+            element = f"length {each.between[0]!r} to {each.between[1]!r}"
+            for name in each.between:
+                self.point(name, element)
+            if each.between[0] == each.between[1]:
+                raise fault(element, "the two points are one", "Give two points of a bar")
+            if not SIZES[0] * self.size <= self.unit * each.length <= SIZES[1] * self.size:
+                raise fault(
+                    element, f"{each.length:g} does not fit the drawing", "Correct the length"
+                )
+            if not any(set(each.between) <= set(bar.points) for bar in self.entry.bar):
+                raise fault(element, "no bar has both points", "Give two points of one bar")
+
+    def shape(self, bar: str) -> FloatArray:
+        """The points (n, 2) of a bar in its own axes (m), in its order."""
+        return self._shapes[bar]
+
+    def on_body(self, body: str, at: FloatArray, point: str = "") -> FloatArray:
+        """A place of the drawing (2,), that of the point if it is one of a bar, in axes of a body
+        whose origin is the ground's, the first point of a bar, or the point of a slider."""
+        if body in self.bars:
+            bar = self.bars[body]
+            if point in bar.points:
+                return np.asarray(self._shapes[body][bar.points.index(point)])
+            return turned(at - self.points[bar.points[0]], -self.body_angle(body))
+        if body in self.sliders:
+            return turned(at - self.points[self.sliders[body].point], -self.body_angle(body))
+        return at
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names in a message."""
+    return ", ".join(map(repr, names))

@@ -1,0 +1,205 @@
+"""Bars of a planar linkage: their shape from lengths, their inertia, and how they are drawn.
+
+Everything here is in the plane of the drawing (x, y); :func:`in_space` maps it to the x-z plane of
+the world, where positive angles turn from x to z about -y.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.errors import InputError
+from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, visual
+
+FIT_TOLERANCE = 1e-13
+"""Residual of lengths, over the largest of them, at which the shape of a bar has them."""
+FIT_ITERATIONS = 100
+"""Newton steps after which lengths are taken for impossible."""
+DIVERGED = 1e12
+"""Coordinates over the largest of the lengths at which Newton's method has failed."""
+COLLINEAR = 1e-12
+"""Distance of points from a line, over the size of the bar, that is rounding."""
+PALETTE = (
+    (0.0, 0.447, 0.698, 1.0),
+    (0.902, 0.624, 0.0, 1.0),
+    (0.0, 0.62, 0.451, 1.0),
+    (0.8, 0.475, 0.655, 1.0),
+    (0.835, 0.369, 0.0, 1.0),
+    (0.337, 0.706, 0.914, 1.0),
+)
+"""Colours of the bars (red, green, blue, opacity), after Okabe and Ito."""
+GREY = (0.55, 0.57, 0.6, 1.0)
+DARK = (0.15, 0.16, 0.18, 1.0)
+
+
+def in_space(point: FloatArray, layer: float = 0.0) -> FloatArray:
+    """The point (x, y) of the drawing in the world, (x, -layer, y), in m."""
+    return np.array([point[0], -layer, point[1]])
+
+
+def turned(point: FloatArray, angle: float) -> FloatArray:
+    """``point`` (2,), turned by ``angle`` (rad), counter-clockwise."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([c * point[0] - s * point[1], s * point[0] + c * point[1]])
+
+
+def direction_angle(vector: FloatArray) -> float:
+    """Angle (rad) of a vector (2,) against x, in (-pi, pi]."""
+    return float(np.arctan2(vector[1], vector[0]))
+
+
+def own_axes(points: FloatArray) -> FloatArray:
+    """Points (n, 2) in axes that begin at the first of them, with x towards the second."""
+    angle = direction_angle(points[1] - points[0])
+    out = np.array([turned(point - points[0], -angle) for point in points])
+    out[np.abs(out) < COLLINEAR * np.abs(out).max()] = 0.0
+    return out
+
+
+def fitted(points: FloatArray, lengths: Mapping[tuple[int, int], float]) -> FloatArray:
+    """The points (n, 2) next to ``points`` that have given distances.
+
+    Newton's method on the squared distances, with the shortest of all corrections at each step.
+
+    Parameters
+    ----------
+    points
+        Approximate positions.
+    lengths
+        Distances of pairs of them, by their indices.
+
+    Raises
+    ------
+    InputError
+        If no such points are found: lengths that violate the triangle inequality, for example.
+    """
+    out = np.array(points, dtype=float)
+    pairs, wanted = list(lengths), np.array(list(lengths.values()))
+    for _ in range(FIT_ITERATIONS):
+        apart = np.array([out[i] - out[j] for i, j in pairs])
+        residual = wanted**2 - (apart**2).sum(axis=1)
+        if np.abs(residual).max() <= FIT_TOLERANCE * wanted.max() ** 2:
+            return out
+        rows = np.zeros((len(pairs), out.size))
+        for row, (i, j), d in zip(rows, pairs, apart):
+            row[2 * i : 2 * i + 2] = 2.0 * d
+            row[2 * j : 2 * j + 2] = -2.0 * d
+        out += np.linalg.lstsq(rows, residual, rcond=1e-12)[0].reshape(out.shape)
+        if not np.abs(out).max() <= DIVERGED * wanted.max():
+            break
+    raise InputError(
+        "there is no shape with these lengths", remedy="Check the lengths between its points"
+    )
+
+
+def outline(points: FloatArray) -> list[tuple[int, int]]:
+    """Edges of the convex hull of points (n, 2), as pairs of indices: one if they are in line.
+
+    A. M. Andrew, Information Processing Letters 9 (1979) 216.
+    """
+    order = sorted(range(len(points)), key=lambda i: (points[i][0], points[i][1]))
+    rounding = COLLINEAR * float(np.ptp(points, axis=0).max()) ** 2
+
+    def chain(indices: Iterable[int]) -> list[int]:
+        found: list[int] = []
+        for i in indices:
+            while len(found) > 1:
+                a, b = points[found[-1]] - points[found[-2]], points[i] - points[found[-2]]
+                if a[0] * b[1] - a[1] * b[0] > rounding:
+                    break
+                found.pop()
+            found.append(i)
+        return found
+
+    ring = [*chain(order)[:-1], *chain(reversed(order))[:-1]]
+    if len(ring) == 2:
+        return [(ring[0], ring[1])]
+    return list(zip(ring, [*ring[1:], ring[0]]))
+
+
+@dataclass(frozen=True)
+class Slender:
+    """Slender bars of 1 kg in all along the outline of points.
+
+    Attributes
+    ----------
+    length
+        Of all bars (m).
+    centre : (2,)
+        Centre of mass (m).
+    tensor : (3, 3)
+        Inertia about it (m^2, for 1 kg), in the axes x, -y, z of :func:`in_space`.
+    """
+
+    length: float
+    centre: FloatArray
+    tensor: FloatArray
+
+
+def slender(points: FloatArray) -> Slender:
+    """The slender bars along the :func:`outline` of points (n, 2)."""
+    ends = [(points[i], points[j]) for i, j in outline(points)]
+    parts = np.array([np.linalg.norm(b - a) for a, b in ends])
+    weights = parts / parts.sum()
+    centre = sum(w * 0.5 * (a + b) for w, (a, b) in zip(weights, ends))
+    second = np.zeros((2, 2))
+    for w, (a, b) in zip(weights, ends):
+        middle = 0.5 * (a + b) - centre
+        second += w * (np.outer(b - a, b - a) / 12.0 + np.outer(middle, middle))
+    (xx, xy), (_, yy) = second
+    tensor = np.array([[yy, 0.0, -xy], [0.0, xx + yy, 0.0], [-xy, 0.0, xx]])
+    return Slender(float(parts.sum()), np.asarray(centre), tensor)
+
+
+def body_inertia(mass: float, centre: FloatArray, tensor: FloatArray) -> pin.Inertia:
+    """Inertia of a body of ``mass`` (kg) with its centre of mass at (x, y), from the tensor
+    (3, 3) about it (kg m^2)."""
+    out = pin.Inertia(mass, in_space(centre), np.zeros((3, 3)))
+    out.inertia = tensor  # unchecked here: the check of the tree does
+    return out
+
+
+def rod(start: FloatArray, end: FloatArray, radius: float, rgba: Sequence[float]) -> Element:
+    """The ``<visual>`` of a cylinder between two points (3,)."""
+    along = end - start
+    length = float(np.linalg.norm(along))
+    rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along / length).matrix()
+    sizes = {"radius": numbers([radius]), "length": numbers([length])}
+    return visual(pin.SE3(rotation, 0.5 * (start + end)), "cylinder", sizes, rgba)
+
+
+def bar_visuals(
+    points: FloatArray, layer: float, width: float, rgba: Sequence[float]
+) -> tuple[Element, ...]:
+    """A bar as it is drawn: rods along its outline and discs on its points (n, 2).
+
+    ``layer`` is its distance (m) from the plane, ``width`` that of the rods.
+    """
+    rods = [
+        rod(in_space(points[i], layer), in_space(points[j], layer), 0.4 * width, rgba)
+        for i, j in outline(points)
+    ]
+    half = 0.5 * width
+    discs = [
+        rod(in_space(p, layer - half), in_space(p, layer + half), 0.7 * width, rgba) for p in points
+    ]
+    return (*rods, *discs)
+
+
+def pin_visual(point: FloatArray, layers: Sequence[float], width: float) -> Element:
+    """The bolt through the bars in ``layers`` (m) at a point (2,)."""
+    first, last = min(layers) - 0.7 * width, max(layers) + 0.7 * width
+    return rod(in_space(point, first), in_space(point, last), 0.3 * width, DARK)
+
+
+def block(point: FloatArray, angle: float, layer: float, width: float) -> Element:
+    """The sliding block at a point (2,), turned by ``angle`` (rad)."""
+    rotation = pin.rpy.rpyToMatrix(0.0, -angle, 0.0)
+    sizes = {"size": numbers([3.0 * width, width, 2.0 * width])}
+    return visual(pin.SE3(rotation, in_space(point, layer)), "box", sizes, DARK)

@@ -1,0 +1,94 @@
+"""Quantities at many states of a mechanism by the compiled kernel, in one call for all of them."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from srm_mbs._kernel import core
+from srm_mbs._kernel.workspace import LARGE
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rheonomic import all_rows
+from srm_mbs.dynamics.forces import ForceKinematics
+from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.dynamics.observables import Observables
+from srm_mbs.integration.kernel.marshalling import force_struct, system_struct
+from srm_mbs.model.mechanism import per_model
+
+
+def _make_all_rows(mechanism: Mechanism) -> Any:
+    """A kernel system with all rows of closures and drives, unscaled, and no algebra of them."""
+    rows = all_rows(mechanism)
+    own = {
+        "rows": len(rows.g),
+        "structural_rank": 0,
+        "sigma_ref": 1.0,
+        "order": [],
+        "gap_scale": np.ones(len(rows.g)),
+        "drives": rows.drive_constants(),
+    }
+    constants = make_system(mechanism).constants() | rows.constants() | own
+    return core.System(mechanism.model, system_struct(constants), None)  # type: ignore[union-attr]
+
+
+_all_rows_of_model = per_model(_make_all_rows)
+
+
+class CompiledObservables(Observables):
+    """:class:`~srm_mbs.dynamics.observables.Observables`, evaluated by the kernel."""
+
+    @cached_property
+    def _kernel(self) -> Any:
+        mechanism = self.mechanism
+        # Drives start where the mechanism does, and results of large ones hold their workspace.
+        if mechanism.drives or mechanism.model.nv > LARGE:
+            return _make_all_rows(mechanism)
+        return _all_rows_of_model(mechanism)
+
+    def closure_errors(
+        self, t: FloatArray, q: FloatArray, v: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        try:
+            return self._kernel.closure_errors(*_states(t, q, v))  # type: ignore[no-any-return]
+        except ArithmeticError:
+            return super().closure_errors(t, q, v)  # raises the error that says why
+
+    def jacobians(self, t: FloatArray, q: FloatArray) -> FloatArray:
+        try:
+            return self._kernel.jacobians(  # type: ignore[no-any-return]
+                np.ascontiguousarray(t, dtype=float), np.ascontiguousarray(q)
+            )
+        except ArithmeticError:
+            return super().jacobians(t, q)
+
+    def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
+        return self._kernel.energies(np.hstack([q, v]))  # type: ignore[no-any-return]
+
+    def _powers(
+        self,
+        elements: dict[str, ForceKinematics],
+        t: FloatArray,
+        q: FloatArray,
+        v: FloatArray,
+        resting: bool = False,
+    ) -> dict[str, FloatArray]:
+        own = {name: element.constants() for name, element in elements.items()}
+        compiled = [name for name, constants in own.items() if constants]
+        called = {name: elements[name] for name in elements if name not in compiled}
+        powers = super()._powers(called, t, q, v, resting) if called else {}
+        if compiled:
+            structs = [force_struct(**own[name][0]) for name in compiled]
+            try:
+                found = self._kernel.powers(*_states(t, q, v), structs, resting)
+            except ArithmeticError:
+                return super()._powers(elements, t, q, v, resting)
+            powers |= dict(zip(compiled, found.T))
+        return {name: powers[name] for name in elements}
+
+
+def _states(t: FloatArray, q: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) and states (n, nx), as the kernel takes them."""
+    return np.ascontiguousarray(t, dtype=float), np.hstack([q, v])

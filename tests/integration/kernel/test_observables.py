@@ -1,0 +1,152 @@
+"""Quantities at many states by the kernel agree with the Python reference."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import srm_mbs as srm
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.geometry import geometry_of, separated_pattern
+from srm_mbs.dynamics.constraints.row_algebra import SingularValues
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.dynamics.observables import Observables
+from srm_mbs.errors import EvaluationError
+from srm_mbs.integration.kernel import backend as kernel
+from srm_mbs.integration.kernel.observables import CompiledObservables
+from tests.support.bundled import load
+from tests.support.mechanisms import floating_ring, random_state
+
+pytestmark = pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
+
+COUNT = 7
+GROUND = srm.Anchor("world", xyz=(0.1, -0.2, 0.3))
+LINK = srm.Anchor("coupler", xyz=(0.05, 0.02, -0.03), rpy=(0.3, -0.2, 0.5))
+ELEMENTS: dict[str, tuple[srm.ForceElement, ...]] = {
+    "springs with damping": (
+        srm.SpringDamper(LINK, GROUND, 30.0, 2.0, 0.2, "strut"),
+        srm.SpringDamper(LINK, GROUND, 30.0, 0.0, 0.2, "without damping"),
+        srm.SpringDamper(LINK, GROUND, 0.0, 3.0, 0.0, "damper"),
+    ),
+    "a bushing": (
+        srm.Bushing(LINK, GROUND, (5.0, 6.0, 7.0, 1.0, 2.0, 3.0), (0.5,) * 6, "bushing"),
+    ),
+    "springs on joints": (
+        srm.TorsionSpring("crank", 4.0, 0.7, 0.3, name="torsion"),
+        srm.LimitSpring("crank", 100.0, 3.0, lower=-0.4, upper=0.5, depth=0.3, name="limit"),
+        srm.CouplingSpring(("crank", "coupler"), (1.0, -2.0), 6.0, 0.4, 0.1, name="coupling"),
+    ),
+    "loads": (
+        srm.JointTorque("crank", 2.0, name="torque"),
+        srm.Wrench(LINK, (1.0, 2.0, 3.0), (0.3, 0.2, 0.1), "link", name="wrench"),
+        srm.UserForce(lambda t, q, v: -0.3 * v * (1.0 + t), name="function"),
+    ),
+}
+
+
+def states(mechanism: srm.Mechanism) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times and states of any kind, which need not be closed."""
+    rng = np.random.default_rng(5)
+    found = [random_state(mechanism.model, rng) for _ in range(COUNT)]
+    q, v = (np.array(numbers) for numbers in zip(*found))
+    return rng.uniform(0.0, 1.0, COUNT), q, v
+
+
+def both(mechanism: srm.Mechanism) -> tuple[Observables, Observables]:
+    system = make_system(mechanism)
+    return CompiledObservables(system), Observables(system)
+
+
+def same(found: FloatArray, expected: FloatArray) -> None:
+    """Equal to 1e-12 of the largest number."""
+    assert found.shape == expected.shape
+    np.testing.assert_allclose(
+        found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max(initial=1.0)
+    )
+
+
+@pytest.mark.parametrize(
+    "name", ["stewart_platform", "delta_robot", "bricard", "n_four_bar_2", "spatial_four_bar"]
+)
+def test_closures_and_energies_of_many_states_are_those_of_the_reference(name: str) -> None:
+    mechanism = load(name)
+    t, q, v = states(mechanism)
+    compiled, reference = both(mechanism)
+    for found, expected in zip(
+        compiled.closure_errors(t, q, v), reference.closure_errors(t, q, v), strict=True
+    ):
+        same(found, expected)
+    same(compiled.jacobians(t, q), reference.jacobians(t, q))
+    same(compiled.energies(q, v), reference.energies(q, v))
+
+
+def test_rows_of_drives_have_the_rate_of_their_motion() -> None:
+    mechanism = load("five_bar")
+    joint = mechanism.joint_names[0]
+    drive = srm.Drive(joint=joint, law=srm.Sine(0.3, omega=2.0), name="motor")
+    driven = srm.Mechanism(
+        mechanism.model, mechanism.loops, q0=mechanism.q0, v0=mechanism.v0, drives=(drive,)
+    )
+    t, q, v = states(driven)
+    compiled, reference = both(driven)
+    for found, expected in zip(compiled.closure_errors(t, q, v), reference.closure_errors(t, q, v)):
+        same(found, expected)
+    assert np.abs(compiled.jacobians(t, q)[:, -1, -1]).min() > 1e-3
+    same(compiled.jacobians(t, q), reference.jacobians(t, q))
+
+
+def test_closures_on_lie_groups_are_those_of_the_reference() -> None:
+    mechanism = floating_ring()
+    t, q, v = states(mechanism)
+    compiled, reference = both(mechanism)
+    same(compiled.jacobians(t, q), reference.jacobians(t, q))
+    same(compiled.energies(q, v), reference.energies(q, v))
+
+
+@pytest.mark.parametrize("kind", ELEMENTS)
+def test_powers_and_potentials_of_elements_are_those_of_the_reference(kind: str) -> None:
+    bare = load("spatial_four_bar")
+    forces = ELEMENTS[kind]
+    mechanism = srm.Mechanism(bare.model, bare.loops, q0=bare.q0, v0=bare.v0, forces=forces)
+    t, q, v = states(mechanism)
+    compiled, reference = both(mechanism)
+    found, expected = compiled.powers(t, q, v), reference.powers(t, q, v)
+    assert list(found) == list(expected) == [f.name for f in forces if f.name != "without damping"]
+    for name, power in expected.items():
+        assert np.abs(power).max() > 0.0
+        same(found[name], power)
+    same(compiled.energies(q, v), reference.energies(q, v))
+
+
+def test_a_force_without_direction_is_refused_by_both_alike() -> None:
+    bare = load("spatial_four_bar")
+    bearing = srm.Anchor("world", xyz=tuple(bare.model.jointPlacements[1].translation))
+    strut = srm.SpringDamper(srm.Anchor("crank"), bearing, 8.0, 1.0, 0.5, "strut")
+    mechanism = srm.Mechanism(bare.model, bare.loops, q0=bare.q0, v0=bare.v0, forces=(strut,))
+    for observables in both(mechanism):
+        with pytest.raises(EvaluationError, match="'strut' coincide"):
+            observables.powers(*states(mechanism))
+
+
+def test_states_of_another_size_are_refused() -> None:
+    compiled, _ = both(load("four_bar"))
+    t, q, v = states(load("four_bar"))
+    with pytest.raises(ValueError, match="do not fit"):
+        compiled.closure_errors(t[:-1], q, v)
+    with pytest.raises(ValueError, match="do not fit"):
+        compiled.jacobians(t, v[:, :-1])
+
+
+@pytest.mark.parametrize(("loops", "spread"), [(2, 0.0), (40, 0.0), (40, 0.3)])
+def test_singular_values_of_many_rows_are_those_of_lapack(loops: int, spread: float) -> None:
+    mechanism = srm.n_four_bar(loops)
+    rng = np.random.default_rng(1)
+    q = mechanism.q0 + spread * rng.standard_normal((5, mechanism.model.nq))
+    geometry, rank = geometry_of(mechanism, mechanism.q0), mechanism.structure.rank
+    compiled, _ = both(mechanism)
+    rows = geometry.separated_rows(compiled.jacobians(np.zeros(5), q))
+    found = SingularValues(separated_pattern(mechanism))(rows, rank)
+    expected = np.linalg.svd(rows, compute_uv=False)[:, rank - 1]
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-15)
+    one_by_one = np.array([geometry.separated(place) for place in q])
+    same(rows, one_by_one)

@@ -326,7 +326,8 @@ def parse_xml(text: str, file: str, notes: list[str] | None = None) -> Element:
             remedy="Split the file, or remove what is not needed",
         )
     try:
-        root = _parsed(text)
+        with naming(file=file):
+            root = _parsed(text)
     except ParseError as error:
         # Drake's own reader takes <drake:...> without a declaration; expat does not.
         declared = _with_prefixes(text) if "unbound prefix" in str(error) else text
@@ -352,6 +353,8 @@ def parse_xml(text: str, file: str, notes: list[str] | None = None) -> Element:
             file=file,
             remedy="Remove them; they are refused for safety",
         ) from error
+    except InputError:
+        raise
     except ValueError as error:  # a surrogate, which no encoding has
         raise InputError(
             f"this is not well-formed XML: {shortened(str(error))}",
@@ -363,10 +366,37 @@ def parse_xml(text: str, file: str, notes: list[str] | None = None) -> Element:
     return root
 
 
+class _ShallowTree(TreeBuilder):
+    """Ends the parser at an element that is nested too deep, instead of building all of them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._depth = 0
+
+    def start(self, tag: str, attributes: dict[str, str], /) -> Element:
+        self._depth += 1
+        if self._depth > LARGEST_NESTING + 1:
+            raise _too_deep(tag.rpartition("}")[2])
+        return super().start(tag, attributes)
+
+    def end(self, tag: str, /) -> Element:
+        self._depth -= 1
+        return super().end(tag)
+
+
+def _too_deep(tag: str) -> InputError:
+    """Of elements nested deeper than the readers, which recurse, can follow."""
+    return InputError(
+        f"more than {LARGEST_NESTING} elements are nested",
+        element=f"<{shortened(tag)}>",
+        remedy="Write such a long chain as a URDF, which is flat",
+    )
+
+
 def _parsed(text: str) -> Element:
     """Root element of ``text``, which is handed over in pieces: the time of the parser would grow
     without bound with the length of an attribute or a comment."""
-    parser = SafeTree.DefusedXMLParser(target=TreeBuilder())
+    parser = SafeTree.DefusedXMLParser(target=_ShallowTree())
     size = 0
     for start in range(0, len(text), PIECE):
         piece = text[start : start + PIECE].encode()
@@ -390,11 +420,7 @@ def check_tree(root: Element) -> None:
     level, depth = [root], 0
     while level:
         if depth > LARGEST_NESTING:
-            raise InputError(
-                f"more than {LARGEST_NESTING} elements are nested",
-                element=f"<{shortened(local_name(level[0]))}>",
-                remedy="Write such a long chain as a URDF, which is flat",
-            )
+            raise _too_deep(local_name(level[0]))
         for node in level:
             for text in (str(node.tag), *node.attrib):
                 if len(text) > LONGEST_NAME:

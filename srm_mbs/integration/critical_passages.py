@@ -304,7 +304,8 @@ class PassageAlongCurve:
         self._heading = -float(np.sign(self._start))
         self._width = curve.width or abs(self._start)
         if begun is None:
-            self._energy = 0.5 * here.inertia * float(curve.along @ rates) ** 2
+            speed = float(curve.along @ rates) / float(curve.along @ here.tangent)
+            self._energy = 0.5 * here.inertia * speed**2
         else:
             self._energy = begun.energy
         self._clock, self._found = self.t, [(here, self._energy, self.t)]

@@ -158,7 +158,12 @@ class ConstraintMonitor:
         """Whether the closures have a residual at the critical configuration next to the motion at
         t (s) that the run followed."""
         found = self.critical(t)
-        return found is not None and abs(found.residual) > self._tolerance
+        return found is not None and self.follows(found)
+
+    def follows(self, critical: CriticalConfiguration) -> bool:
+        """Whether the run followed the residual at a critical configuration, not counted it as
+        zero."""
+        return abs(critical.residual) > self._tolerance
 
     def minimum(self, t: FloatArray, values: FloatArray, power: int = 2) -> tuple[float, float]:
         """Time and value of the minimum bracketed by t (3,), values (3,) there.
@@ -486,15 +491,21 @@ def _along_curve(steps: StepData, time: float) -> bool:
 
 
 def _crossings_along_curves(monitor: ConstraintMonitor, steps: StepData) -> list[Crossing]:
-    """The passages that were followed along the curve of closed configurations."""
+    """The passages that were followed along the curve of closed configurations.
+
+    Steps of regular motions may follow a curve too, beside a critical configuration far away.
+    """
     marked = (steps.placements == CRITICAL).astype(int)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], marked, [0]])))
     found = []
     for first, last in zip(edges[::2].tolist(), edges[1::2].tolist()):
         lowest = first + int(np.argmin(steps.sigmas[first:last, -1]))
         time = float(steps.times[lowest + 1])
+        critical = monitor.critical(time)
+        if critical is None:
+            continue
         beside = 0.25 * float(steps.times[last] - steps.times[first])
-        kind = "avoided" if monitor.avoids(time) else "passed"
+        kind = "avoided" if monitor.follows(critical) else "passed"
         found.append(crossing_at(monitor, steps, time, beside, kind))
     return found
 

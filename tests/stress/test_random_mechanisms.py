@@ -11,8 +11,9 @@ from scipy.integrate import trapezoid
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import LoopKinematics, closure_errors
 from srm_mbs.dynamics.scaling import row_units
+from srm_mbs.integration.dense_output import CRITICAL
 from tests.stress.patience import Patience
-from tests.stress.random_mechanisms import Spec, build, specs
+from tests.stress.random_mechanisms import Closure, Spec, build, specs
 
 pytestmark = [pytest.mark.stress, pytest.mark.timeout(900)]
 
@@ -80,6 +81,27 @@ def check(spec: Spec) -> None:
 @given(specs(planar=True))
 def test_random_planar_mechanisms_keep_energy_and_closures(spec: Spec) -> None:
     check(spec)
+
+
+BALL_BESIDE_A_CRITICAL_CONFIGURATION = Spec(
+    planar=False,
+    seed=7000,
+    length=0.017323653741397528,
+    parents=(-1, 0),
+    joints=("revolute", "ball"),
+    closures=(Closure("point_on_line", 0, 1, copies=2), Closure("point_on_plane", 1, -1)),
+)
+"""Half a radian of rotation away from it: rates of rotation vectors differ from velocities."""
+
+
+@pytest.mark.parametrize("backend", ["kernel", "python"])
+def test_a_ball_joint_far_from_a_critical_configuration_keeps_its_energy(backend: str) -> None:
+    mechanism = assembled(BALL_BESIDE_A_CRITICAL_CONFIGURATION)
+    for rtol in (1e-8, 1e-10):
+        solution = srm.simulate(mechanism, T_END, rtol=rtol, backend=backend)
+        assert CRITICAL in solution.steps.placements
+        assert np.abs(solution.energy - solution.energy[0]).max() <= 1e-10
+        assert solution.crossings == ()
 
 
 @settings(deterministic, max_examples=50)

@@ -243,7 +243,8 @@ public:
             throw NoPassage{};
         heading_ = start > 0.0 ? -1.0 : 1.0;
         width_ = curve_.width > 0.0 ? curve_.width : std::abs(start);
-        const double speed = dot(curve_.along.data(), rates.data(), n_);
+        const double speed = dot(curve_.along.data(), rates.data(), n_) /
+                             dot(curve_.along.data(), here.tangent.data(), n_);
         energy_ = begun ? motion.energy : 0.5 * here.inertia * speed * speed;
         clock_ = t;
         found_.push_back({std::move(here), energy_, t});

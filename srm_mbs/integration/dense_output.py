@@ -306,11 +306,20 @@ class StepData:
         """Number of steps."""
         return len(self.times) - 1
 
-    @property
+    @cached_property
+    def critical_ranges(self) -> list[tuple[int, int]]:
+        """First step, and the one after the last, of each passage past a critical configuration."""
+        critical = self.placements == CRITICAL
+        if not np.logical_or.reduce(critical):
+            return []
+        edges = np.flatnonzero(np.diff(critical, prepend=False, append=False)).tolist()
+        return list(zip(edges[::2], edges[1::2]))
+
+    @cached_property
     def between_nodes(self) -> list[int]:
         """The steps, ascending, that are known by the states and rates at their ends alone: those
         with a stage in the zone, and those past a critical configuration."""
-        critical = np.flatnonzero(self.placements == CRITICAL).tolist()
+        critical = (step for one in self.critical_ranges for step in range(*one))
         return sorted({*self.zones, *critical})
 
     @cached_property
@@ -321,9 +330,7 @@ class StepData:
         steps there.
         """
         out = np.zeros((self.count, 2))
-        marked = (self.placements == CRITICAL).astype(int)
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], marked, [0]])))
-        for first, last in zip(edges[::2].tolist(), edges[1::2].tolist()):
+        for first, last in self.critical_ranges:
             sigmas = np.append(self.sigmas[first:last, 0], self.sigmas[last - 1, -1])
             k = int(np.argmin(sigmas))
             if not 0 < k < last - first:

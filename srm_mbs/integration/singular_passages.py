@@ -495,10 +495,8 @@ def _crossings_along_curves(monitor: ConstraintMonitor, steps: StepData) -> list
 
     Steps of regular motions may follow a curve too, beside a critical configuration far away.
     """
-    marked = (steps.placements == CRITICAL).astype(int)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], marked, [0]])))
     found = []
-    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist()):
+    for first, last in steps.critical_ranges:
         lowest = first + int(np.argmin(steps.sigmas[first:last, -1]))
         time = float(steps.times[lowest + 1])
         critical = monitor.critical(time)
@@ -570,7 +568,7 @@ def find_crossings(
         for begin, end in _windows(_may_vanish(sigma, lowest, scheme.n_stages))
         if (dips := _dips(sigma[begin : end + 1], lowest[begin:end]))
     ]
-    if not windows and not (steps.placements == CRITICAL).any():
+    if not windows and not steps.critical_ranges:
         return ()
     monitor = monitor or ConstraintMonitor(analysis, dense, tolerance)
     tops = [t[begin + int(np.argmax(sigma[begin : end + 1]))] for begin, end, _ in windows]

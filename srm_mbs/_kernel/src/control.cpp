@@ -338,36 +338,53 @@ StepDecision BranchGuard::decide(const Proposal& proposal, const StepResult* res
 
 namespace {
 
-// Residual norm of the least-squares polynomial (lowest power first) through (c, values); its
-// coefficients by Householder QR of the Vandermonde matrix.
-double misfit(const std::vector<double>& c, const std::vector<double>& values, int degree,
-              double* coefficients) {
-    const int rows = static_cast<int>(c.size()), columns = degree + 1;
-    std::vector<double> A(rows * columns), y(values), tau(columns);
-    for (int i = 0; i < rows; ++i)
-        for (int j = 0; j < columns; ++j) A[j * rows + i] = std::pow(c[i], j);
-    for (int k = 0; k < columns; ++k) {
-        double* a = &A[k * rows];
-        const double size = norm(a + k, rows - k);
-        const double beta = -std::copysign(size, a[k]);
-        const double head = a[k] - beta;
-        const auto reflect = [&](double* x) {
-            const double s =
-                (head * x[k] + dot(a + k + 1, x + k + 1, rows - k - 1)) / (-beta * head);
-            x[k] -= s * head;
-            add(-s, a + k + 1, x + k + 1, rows - k - 1);
-        };
-        for (int j = k + 1; j < columns; ++j) reflect(&A[j * rows]);
-        reflect(y.data());
-        a[k] = beta;
+// Least-squares polynomials of one degree at the abscissae c: Householder QR of the Vandermonde
+// matrix.
+class PolynomialFit {
+public:
+    PolynomialFit(const std::vector<double>& c, int degree)
+        : rows_(static_cast<int>(c.size())),
+          columns_(degree + 1),
+          A_(static_cast<std::size_t>(rows_) * columns_),
+          head_(columns_),
+          diagonal_(columns_) {
+        for (int i = 0; i < rows_; ++i) {
+            double power = 1.0;
+            for (int j = 0; j < columns_; ++j, power *= c[i]) A_[j * rows_ + i] = power;
+        }
+        for (int k = 0; k < columns_; ++k) {
+            const double* a = &A_[k * rows_];
+            diagonal_[k] = -std::copysign(norm(a + k, rows_ - k), a[k]);
+            head_[k] = a[k] - diagonal_[k];
+            for (int j = k + 1; j < columns_; ++j) reflect(k, &A_[j * rows_]);
+        }
     }
-    for (int k = columns - 1; k >= 0; --k) {
-        double sum = y[k];
-        for (int j = k + 1; j < columns; ++j) sum -= A[j * rows + k] * coefficients[j];
-        coefficients[k] = sum / A[k * rows + k];
+
+    // Norm of the residual for `values`, which are overwritten, and the coefficients, lowest power
+    // first.
+    double fit(std::vector<double>& values, double* coefficients) const {
+        for (int k = 0; k < columns_; ++k) reflect(k, values.data());
+        for (int k = columns_ - 1; k >= 0; --k) {
+            double sum = values[k];
+            for (int j = k + 1; j < columns_; ++j) sum -= A_[j * rows_ + k] * coefficients[j];
+            coefficients[k] = sum / diagonal_[k];
+        }
+        return norm(&values[columns_], rows_ - columns_);
     }
-    return norm(&y[columns], rows - columns);
-}
+
+private:
+    void reflect(int k, double* x) const {
+        const double* a = &A_[k * rows_];
+        const int below = rows_ - k - 1;
+        const double s =
+            (head_[k] * x[k] + dot(a + k + 1, x + k + 1, below)) / (-diagonal_[k] * head_[k]);
+        x[k] -= s * head_[k];
+        add(-s, a + k + 1, x + k + 1, below);
+    }
+
+    int rows_, columns_;
+    std::vector<double> A_, head_, diagonal_;
+};
 
 }  // namespace
 
@@ -383,14 +400,14 @@ double zero_within(const std::vector<double>& abscissae, const std::vector<doubl
         sigma[i] = sigmas[order[i]];
     }
     if (!(*std::max_element(sigma.begin(), sigma.end()) > 0.0)) return nan;
-    const int degree = n > 4 ? 2 : 1;
+    const PolynomialFit polynomials(c, n > 4 ? 2 : 1);
     double best = inf, zero = nan;
     for (int k = 1; k <= n; ++k) {
         const double after = k < n ? c[k] : 1.1;
         if (after <= c[k - 1]) continue;
         for (int i = 0; i < n; ++i) values[i] = i < k ? sigma[i] : -sigma[i];
         double p[3] = {0.0, 0.0, 0.0};
-        const double error = misfit(c, values, degree, p);
+        const double error = polynomials.fit(values, p);
         if (!(error < best)) continue;
         double roots[2];
         int found = 0;

@@ -354,6 +354,7 @@ def extension_struct(extension: DenseExtension) -> Any:
     )
 
 
+@lru_cache(maxsize=1)
 def dense_constants() -> Any:
     """``DenseConstants`` of dense.hpp."""
     return _core.DenseConstants(
@@ -381,6 +382,7 @@ def dense_structs(scheme: ButcherTableau) -> tuple[SchemeDense, Any]:
     return scheme_dense(scheme), dense_constants()
 
 
+@lru_cache(maxsize=64)
 def scheme_denses(scheme: ButcherTableau) -> list[SchemeDense]:
     """Those of a run: of ``scheme`` and, where it has one, of its scheme for stiff problems."""
     return [scheme_dense(one) for one in (scheme, scheme.stiff) if one is not None]

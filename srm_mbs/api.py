@@ -322,10 +322,10 @@ def simulate(
     """
     options = locals()  # every other parameter is one
     del options["mechanism"]
-    return _told(run(mechanism, RunOptions(**options), SOLUTIONS))
+    return _with_warning(run(mechanism, RunOptions(**options), SOLUTIONS))
 
 
-def _told(result: Outcome) -> Outcome:
+def _with_warning(result: Outcome) -> Outcome:
     """``result``, with a warning if the run failed, so that nobody reads half of it as the whole.
 
     Runs that the package makes for itself, such as those of a certificate, do not warn.
@@ -426,7 +426,9 @@ def solve_dae(
     options = locals()  # every other parameter is one
     for name in ("problem", "t_span", "x0"):
         del options[name]
-    return _told(run_dae(problem, t_span, x0, RunOptions(t_end=None, **options), DaeSolution))
+    return _with_warning(
+        run_dae(problem, t_span, x0, RunOptions(t_end=None, **options), DaeSolution)
+    )
 
 
 def load_solution(

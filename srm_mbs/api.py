@@ -10,15 +10,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from srm_mbs.dynamics.controllers import Controller
 from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.errors import FailedRunWarning, warn
 from srm_mbs.formats.files import checked_path
-from srm_mbs.integration.driver import Tick
+from srm_mbs.integration.driver import RunStatus, Tick
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.anchors import Anchor
@@ -27,13 +28,15 @@ from srm_mbs.model.reach import Reach
 from srm_mbs.simulation.dae_result import DaeResult
 from srm_mbs.simulation.dae_run import run_dae
 from srm_mbs.simulation.options import SINGULAR_TOLERANCE, RunOptions
-from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.simulation.result import RunOutcome, SimulationResult
 from srm_mbs.simulation.segmented_result import ResultTypes, SegmentedResult
 from srm_mbs.simulation.segmented_run import run
 from srm_mbs.visualization.animation.joint_motion import AnimationMixin
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+Outcome = TypeVar("Outcome", bound=RunOutcome)
 
 
 class Solution(AnimationMixin, SimulationResult):
@@ -303,8 +306,9 @@ def simulate(
     Returns
     -------
     Solution
-        With ``success`` False and everything computed so far if the run could not go on; ``error``
-        is the exception of a controller, force or event function that failed during the run.
+        With ``success`` False, everything computed so far and a :class:`SrmWarning` if the run
+        could not go on; ``error`` is the exception of a controller, force or event function that
+        failed during the run.
 
     Raises
     ------
@@ -318,7 +322,17 @@ def simulate(
     """
     options = locals()  # every other parameter is one
     del options["mechanism"]
-    return run(mechanism, RunOptions(**options), SOLUTIONS)
+    return _with_warning(run(mechanism, RunOptions(**options), SOLUTIONS))
+
+
+def _with_warning(result: Outcome) -> Outcome:
+    """``result``, with a warning if the run failed, so that nobody reads half of it as the whole.
+
+    Runs that the package makes for itself, such as those of a certificate, do not warn.
+    """
+    if result.status is RunStatus.FAILED:
+        warn(result.message, FailedRunWarning)
+    return result
 
 
 def solve_dae(
@@ -395,8 +409,9 @@ def solve_dae(
     Returns
     -------
     DaeSolution
-        With ``success`` False and everything computed so far if the run could not go on: a
-        function of the problem that raises, or returns what is not finite, included.
+        With ``success`` False, everything computed so far and a :class:`SrmWarning` if the run
+        could not go on: a function of the problem that raises, or returns what is not finite,
+        included.
 
     Raises
     ------
@@ -411,7 +426,9 @@ def solve_dae(
     options = locals()  # every other parameter is one
     for name in ("problem", "t_span", "x0"):
         del options[name]
-    return run_dae(problem, t_span, x0, RunOptions(t_end=None, **options), DaeSolution)
+    return _with_warning(
+        run_dae(problem, t_span, x0, RunOptions(t_end=None, **options), DaeSolution)
+    )
 
 
 def load_solution(

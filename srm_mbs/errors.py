@@ -269,10 +269,14 @@ class SrmWarning(UserWarning):
         return printable(super().__str__(), keep="\n")
 
 
-def warn(message: str) -> None:
-    """Issue a :class:`SrmWarning` that points at the first caller outside the package."""
+class FailedRunWarning(SrmWarning):
+    """A run failed before its end; its result holds what was computed so far."""
+
+
+def warn(message: str, category: type[SrmWarning] = SrmWarning) -> None:
+    """Issue a warning of ``category`` that points at the first caller outside the package."""
     package = os.path.dirname(__file__)
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_code.co_filename.startswith(package):
         level, frame = level + 1, frame.f_back
-    warnings.warn(message, SrmWarning, stacklevel=level)
+    warnings.warn(message, category, stacklevel=level)

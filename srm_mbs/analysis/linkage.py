@@ -26,6 +26,7 @@ from scipy.optimize import brentq
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.analysis.path_following import follow
+from srm_mbs.assembly.position import ClosureProblem, polish
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.dynamics.constraints.wrenches import Placements
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
@@ -48,6 +49,9 @@ WHOLE_TURN = 0.5
 """Net motion (rad) of a joint over a turn of the crank above which it turns fully itself."""
 REFINED = 1e-12
 """Accuracy (rad, m) of the crank's position at a limit."""
+CORRECTION = 0.1
+"""Distance of a closed configuration from the tangent of the path, over the way along it, below
+which it is on that path."""
 
 
 @dataclass(frozen=True)
@@ -293,6 +297,9 @@ class _Analysis:
         self.joints: KnownKeys[FloatArray] = KnownKeys((name, self._track(name)) for name in names)
         with np.errstate(divide="ignore", invalid="ignore"):
             along = rates / rates[:, [mechanism.joint(crank).idx_v]]
+        self._along = along
+        self._closures = ClosureProblem(mechanism, mechanism.q0)
+        self._free = np.delete(np.arange(mechanism.model.nv), mechanism.joint(crank).idx_v)
         self.ratios: KnownKeys[FloatArray] = KnownKeys(
             (name, along[:, mechanism.joint(name).idx_v]) for name in names
         )
@@ -361,19 +368,29 @@ class _Analysis:
         positions k and k + 1."""
         column = self.mechanism.joint(name).idx_v
 
-        def configuration(crank: float) -> FloatArray:
-            near: FloatArray = follow(self.mechanism, {self.crank: [crank]}, self.q[k]).q[-1]
-            return near
-
         def rate(crank: float) -> float:
-            return float(self.rates(configuration(crank))[column])
+            return float(self.rates(self._configuration(k, crank))[column])
 
         low, high = self.positions[k : k + 2]
         crank = float(brentq(rate, low, high, xtol=REFINED))
-        value = position_of(self.mechanism, configuration(crank), name)
+        value = position_of(self.mechanism, self._configuration(k, crank), name)
         if is_angle(self.mechanism.model, name):
             value += 2.0 * np.pi * np.round((self.joints[name][k] - value) / (2.0 * np.pi))
         return crank, float(value)
+
+    def _configuration(self, k: int, crank: float) -> FloatArray:
+        """The configuration (nq,) where the crank is at ``crank`` (rad, m), next to position k."""
+        problem = self._closures
+        move = self._along[k] * (crank - self.positions[k]) / problem.unit
+        way = float(np.linalg.norm(move))
+        if way < 1.0:  # beside a dead point the tangent is no guess
+            guess = problem.move(self.q[k], move)
+            found = polish(problem, guess, self._free)
+            off = float(np.linalg.norm(problem.difference(guess, found)))
+            if problem.closed(found) and off <= CORRECTION * way + REFINED:
+                return found
+        near: FloatArray = follow(self.mechanism, {self.crank: [crank]}, self.q[k]).q[-1]
+        return near
 
     def _loop(self) -> tuple[FloatArray | None, tuple[float, float, float, float] | None]:
         """Transmission angle (n,), and the lengths of the bars of a four-bar; None for others."""

@@ -1,7 +1,7 @@
 r"""Dragging joints: closed configurations along given values of some coordinates.
 
 The unknowns are the configuration and a path parameter s.  With the dragged coordinates h and their
-values H(s), straight from knot to knot (at s = 0, 1, ...), the path solves
+values H(s), straight from knot to knot and s its length (in units), the path solves
 
     g(q) = 0,   h - H(s) = 0,
 
@@ -171,7 +171,8 @@ class _Follower:
         )
         found = self.correct(guess, across)
         if found is None or not fixed:
-            return found
+            # A point beyond the knot is none of this segment: a shorter step comes before it.
+            return None if found is None or found[0].s > end else found
         point, correction = found
         sharp = onto_singular_point(self.problem, point.q, self.free)
         return _Point(sharp, point.h, end), correction
@@ -225,17 +226,17 @@ def drag(
     follower = _Follower(problem, columns, rank, q)
     reached, complete = [q], True
     old: FloatArray | None = None
-    for k, slope in enumerate(np.diff(knots, axis=0)):
-        if not slope.any():
-            here = follower.points[-1]
-            follower.points[-1] = _Point(here.q, here.h, k + 1.0)
-            reached.append(here.q)
+    for knot, way in zip(knots, np.diff(knots, axis=0)):
+        start, length = follower.points[-1].s, float(np.linalg.norm(way))
+        if start + length == start:
+            reached.append(follower.points[-1].q)
             continue
-        follower.segment(float(k), knots[k], slope)
+        slope = way / length
+        follower.segment(start, knot, slope)
         before = None if old is None else _carried(follower.tangents[-1], old, slope)
         follower.tangents.append(follower.tangent(follower.points[-1].q, before))
         old = slope
-        if not follower.run(k + 1.0):
+        if not follower.run(start + length):
             complete = False
             break
         reached.append(follower.points[-1].q)

@@ -241,7 +241,7 @@ def _search(
     return problem.move(q, found.x, free)
 
 
-def _polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
+def polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
     """Newton's iteration on the closure rows, by shortest steps of the ``free`` coordinates."""
 
     def linearise(q: FloatArray) -> tuple[float, Callable[[], FloatArray]]:
@@ -279,9 +279,9 @@ def close_positions(
     ``bounds`` are the least and largest motions of these, in units.
     """
     if np.linalg.norm(problem.mismatch(q)) <= CONSTRAINT_TOLERANCE:
-        return problem.unwrapped(_polish(problem, q, free))
+        return problem.unwrapped(polish(problem, q, free))
     for near in (True, False):  # without damping where no configuration near q is closed
-        found = _polish(problem, _search(problem, q, free, steps, bounds, near=near), free)
+        found = polish(problem, _search(problem, q, free, steps, bounds, near=near), free)
         if problem.closed(found):
             break
     return problem.unwrapped(found)

@@ -34,7 +34,7 @@ Hold = Annotated[
 ]
 
 
-def _values(given: list[str] | None, element: str) -> tuple[dict[str, list[float]], list[str]]:
+def joint_values(given: list[str] | None, element: str) -> tuple[dict[str, list[float]], list[str]]:
     """Joints with values (``JOINT=VALUE,...``), and those without."""
     values: dict[str, list[float]] = {}
     names = []
@@ -58,7 +58,7 @@ def _values(given: list[str] | None, element: str) -> tuple[dict[str, list[float
 
 def _held(given: list[str] | None) -> tuple[dict[str, float], list[str]]:
     """Positions of the held joints that have one, and all their names."""
-    values, names = _values(given, "--hold")
+    values, names = joint_values(given, "--hold")
     if any(len(numbers) > 1 for numbers in values.values()):
         raise InputError("a held joint takes one value", element="--hold", remedy="Give one value")
     positions = {name: numbers[0] for name, numbers in values.items()}
@@ -238,7 +238,7 @@ def drag(
 
     check_output(html, "--html", HTML_SUFFIXES)
     mechanism = file.load()
-    targets, bare = _values(values, "JOINT=VALUE")
+    targets, bare = joint_values(values, "JOINT=VALUE")
     if bare:
         raise InputError(
             f"joint {bare[0]!r} has no value", element="JOINT=VALUE", remedy="Write crank=1.5"

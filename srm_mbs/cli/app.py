@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 # Before NumPy is loaded: for matrices of this size the threads of BLAS cost more than they gain.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -45,6 +45,9 @@ from srm_mbs.cli.output import (
     write_files,
 )
 from srm_mbs.errors import InputError
+
+if TYPE_CHECKING:
+    from srm_mbs.dynamics.mechanism import Mechanism
 
 T_END, RTOL = 10.0, 1e-6
 """End time (s) and tolerance where neither the command nor the description gives one."""
@@ -175,6 +178,30 @@ def simulate(
     ] = False,
     play: Annotated[bool, typer.Option("--play", help="Play the run in the browser.")] = False,
     live: playback.Live = False,
+    base: Annotated[
+        str | None, option("fixed|floating|planar", "Root joint instead of the file's.")
+    ] = None,
+    gravity: Annotated[
+        str | None, option("X,Y,Z", "Gravity (m/s^2) instead of the file's, as 0,0,-1.62.")
+    ] = None,
+    q: Annotated[
+        list[str] | None,
+        several(
+            "--q",
+            "JOINT=VALUE",
+            "Start with a joint at VALUE (rad, m; all coordinates of a ball as 0,0,0,1); "
+            "the others close the loops.",
+        ),
+    ] = None,
+    v: Annotated[
+        list[str] | None,
+        several(
+            "--v",
+            "JOINT=RATE",
+            "Start with a joint at RATE (rad/s, m/s); with --q or --v other rates are the "
+            "smallest that keep the loops closed.",
+        ),
+    ] = None,
 ) -> None:
     """Simulate a mechanism and print a summary of the run.
 
@@ -194,7 +221,7 @@ def simulate(
     check_output(html, "--html", HTML_SUFFIXES)
     playback.check_pictures(image, at, video)
 
-    mechanism = file.load()
+    mechanism = _started(file.load(base=base, gravity=_vector(gravity, "--gravity")), q, v)
     overlays = playback.overlay_options(mechanism, trace, gaps, reactions)
     playback.check_overlays(trace, gaps, reactions, (html, image, video, play, live))
     added = playback.points_or_names(points)
@@ -251,6 +278,32 @@ def simulate(
         raise typer.Exit(BAD_INPUT)
     if not solution.success:
         raise typer.Exit(RUN_FAILED)
+
+
+def _vector(text: str | None, element: str) -> list[float] | None:
+    """The numbers of ``X,Y,Z``; None without a text."""
+    try:
+        return None if text is None else [float(number) for number in text.split(",")]
+    except ValueError:
+        raise InputError(
+            f"{text!r} is not a vector", element=element, remedy="Write 0,0,-9.81"
+        ) from None
+
+
+def _started(mechanism: Mechanism, q: list[str] | None, v: list[str] | None) -> Mechanism:
+    """``mechanism``, started with joints at the values of ``--q`` and ``--v``."""
+    if not (q or v):
+        return mechanism
+    given = []
+    for texts, element in ((q, "--q"), (v, "--v")):
+        values, bare = analysis.joint_values(texts, element)
+        if bare:
+            raise InputError(
+                f"joint {bare[0]!r} has no value", element=element, remedy="Write crank=1.5"
+            )
+        given.append({name: n[0] if len(n) == 1 else n for name, n in values.items()} or None)
+    start = srm_mbs.assemble(mechanism, *given)
+    return mechanism.with_state(start.q, start.v)
 
 
 def _first(*values: float | None) -> float:

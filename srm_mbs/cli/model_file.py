@@ -72,9 +72,9 @@ class ModelFile:
             "closing_tolerance": self.closing_tolerance,
         }
 
-    def load(self) -> Mechanism:
-        """The mechanism."""
-        return srm_mbs.load(self.model, **self.options())
+    def load(self, **more: Any) -> Mechanism:
+        """The mechanism; ``more`` are further arguments of ``srm_mbs.load``."""
+        return srm_mbs.load(self.model, **self.options(), **more)
 
 
 def massless_ends(given: str | None) -> str | dict[str, float] | None:

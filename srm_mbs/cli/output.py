@@ -18,6 +18,7 @@ from typer.models import ArgumentInfo, OptionInfo
 
 from srm_mbs.errors import (
     CHECK_WRITING,
+    FailedRunWarning,
     InputError,
     SrmError,
     SrmWarning,
@@ -130,6 +131,7 @@ def _warnings_as_lines() -> Iterator[None]:
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", SrmWarning)
+        warnings.simplefilter("ignore", FailedRunWarning)  # commands say how a run ended
         warnings.showwarning = show
         yield
 

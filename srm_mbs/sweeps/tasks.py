@@ -14,7 +14,7 @@ import numpy as np
 from srm_mbs.api import Solution, simulate
 from srm_mbs.assembly.assemble import assemble
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError, printable, safe_repr
+from srm_mbs.errors import InputError, SimulationError, printable, safe_repr
 from srm_mbs.simulation.result import check_run
 from srm_mbs.sweeps.cases import RESERVED, STARTS
 
@@ -95,7 +95,7 @@ class Task:
             mechanism, chosen = self._made(parameters)
             if self.options is not None:
                 chosen |= self.options(parameters)
-            solution = simulate(mechanism, chosen.pop("t_end", self.t_end), **chosen)
+            solution = _partial_if_failed(mechanism, chosen.pop("t_end", self.t_end), chosen)
             if solution.status == "interrupted":
                 raise KeyboardInterrupt
             measures = checked_measures(self.measure(solution), parameters)
@@ -115,6 +115,15 @@ class Task:
             state = assemble(self.source, **start)
             start = {"q0": state.q, "v0": state.v}
         return self.source, chosen | start
+
+
+def _partial_if_failed(mechanism: Mechanism, t_end: float, options: dict[str, Any]) -> Solution:
+    """The run, also one that failed: its row says so, without a warning."""
+    try:
+        return simulate(mechanism, t_end, **options | {"raise_on_failure": True})
+    except SimulationError as error:
+        partial: Solution = error.solution
+        return partial
 
 
 def checked_measures(

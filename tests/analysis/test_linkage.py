@@ -161,13 +161,27 @@ def test_an_offset_slider_crank_returns_quickly() -> None:
     assert angle.max() == pytest.approx(0.5 * np.pi, abs=0.01)
 
 
-@pytest.mark.stress
 def test_larger_linkages_have_strokes_and_no_transmission_angle() -> None:
     report = srm.linkage_report(load("jansen_walker"), "crank")
     assert report.turns
     assert report.transmission_angle is None
     assert report.lengths is None
     assert all(stroke.length > 0.0 for stroke in report.strokes.values())
+
+
+@pytest.mark.parametrize("name", ["wiper", "toggle_press"])
+def test_every_configuration_of_a_report_is_closed_and_has_the_crank_where_it_says(
+    name: str,
+) -> None:
+    """A step along the path that passes a position must not be taken for it."""
+    mechanism = load(name)
+    crank = mechanism.joint_names[0]
+    report = srm.linkage_report(mechanism, crank)
+    assert len(report.dead_points) == 2
+    for position, q in zip(report.positions, report.q):
+        held = srm.assemble(mechanism, q, hold=[crank])
+        np.testing.assert_allclose(held.q, q, atol=1e-7)  # a dead point is a double root
+        assert q[mechanism.joint(crank).idx_q] == pytest.approx(position, abs=1e-12)
 
 
 def test_what_is_no_linkage_is_refused() -> None:

@@ -31,6 +31,10 @@ simulate four_bar --tableau erk4
 simulate four_bar --backend fortran
 simulate four_bar --image a.png --at 11
 simulate slider_crank --trace rod
+simulate four_bar --gravity down
+simulate four_bar --q crank
+simulate four_bar --q wheel=1
+simulate four_bar --q crank=1 --v crank=fast
 plot nonsense.npz
 plot none/run.npz
 plot text.npz

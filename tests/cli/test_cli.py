@@ -332,6 +332,32 @@ def test_simulate_with_a_fixed_step_takes_that_many() -> None:
     assert row(output, "steps") == "10"
 
 
+def test_simulate_starts_where_it_is_told_under_the_given_gravity(tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    start = ("--q", "crank=1.2", "--v", "crank=3", "--gravity", "0,0,-1.62")
+    run("simulate", "four_bar", "--t-end", 0.2, "--out", path, *start)
+    mechanism = srm.load("four_bar", gravity=(0.0, 0.0, -1.62))
+    begun = srm.assemble(mechanism, {"crank": 1.2}, {"crank": 3.0})
+    expected = srm.simulate(mechanism, 0.2, q0=begun.q, v0=begun.v)
+    solution = srm.load_solution(path)
+    np.testing.assert_array_equal(solution.q, expected.q)
+    np.testing.assert_array_equal(solution.v, expected.v)
+    assert solution.joint("crank")[1][0] == pytest.approx(3.0, rel=1e-14)
+
+
+def test_simulate_with_a_floating_base_falls(tmp_path: Path) -> None:
+    model, path = tmp_path / "stone.urdf", tmp_path / "run.npz"
+    inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    model.write_text(
+        f'<robot name="stone"><link name="stone"><inertial><mass value="2"/>{inertia}'
+        "</inertial></link></robot>"
+    )
+    options = ("--base", "floating", "--gravity", "0,0,-1.62", "--t-end", 2, "--out", path)
+    run("simulate", model, *options)
+    fallen = srm.load_solution(path).q[-1, :3]
+    np.testing.assert_allclose(fallen, [0.0, 0.0, -0.5 * 1.62 * 2.0**2], rtol=1e-9, atol=1e-12)
+
+
 def test_open_chain_has_no_constraint_rows_in_its_summary() -> None:
     output = run("simulate", "pendulum_chain", "--t-end", 0.5)
     assert row(output, "status") == "finished"

@@ -93,6 +93,60 @@ def test_a_later_failure_keeps_the_run_and_its_traceback(kind: str, backend: str
     assert solution.at([0.0]).error is solution.error
 
 
+@pytest.mark.filterwarnings("error")
+@backends
+def test_a_run_that_fails_gives_one_warning_with_its_message(backend: str) -> None:
+    with pytest.warns(srm.SrmWarning) as caught:
+        solution = run("controller", later(mistaken, [0.0, 0.0]), backend=backend)
+    assert solution.status == "failed"
+    (warning,) = caught
+    assert str(warning.message) == solution.message
+    assert warning.filename == __file__
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_dae_that_fails_gives_one_warning_with_its_message() -> None:
+    """x' = 1 - y with x = 0 asks for y = 1, and the function f is no longer defined at t = 0.5."""
+    problem = srm.SemiExplicitDAE(
+        f=lambda t, x: np.ones(1) if t < 0.5 else np.full(1, np.nan),
+        B=lambda t, x: np.ones((1, 1)),
+        g=lambda t, x: x,
+        G=lambda t, x: np.ones((1, 1)),
+    )
+    with pytest.warns(srm.SrmWarning) as caught:
+        solution = srm.solve_dae(problem, (0.0, 1.0), [0.0], max_step=0.1)
+    assert solution.status == "failed"
+    assert [str(warning.message) for warning in caught] == [solution.message]
+
+
+@pytest.mark.filterwarnings("error")
+def test_runs_that_end_as_they_were_asked_to_do_not_warn() -> None:
+    def height(t: float, q: Any, v: Any) -> float:
+        return 0.05 - t
+
+    height.terminal = True  # type: ignore[attr-defined]
+    assert run("event", height).status == "event"
+
+    def stop(t: float, h: float, state: Any) -> None:
+        raise KeyboardInterrupt
+
+    mechanism = load("slider_crank")
+    assert srm.simulate(mechanism, 0.3, progress=stop).status == "interrupted"
+    failing = later(mistaken, [0.0, 0.0])
+    with pytest.raises(srm.SimulationError):
+        srm.simulate(mechanism, 0.3, controller=failing, raise_on_failure=True)
+
+
+@pytest.mark.filterwarnings("error")
+def test_failed_cases_of_a_sweep_are_rows_and_do_not_warn() -> None:
+    mechanism = load("slider_crank")
+    failing = later(mistaken, [0.0, 0.0])
+    table = srm.sweep(mechanism, [{"q0": mechanism.q0}], t_end=0.3, controller=failing).table
+    assert table["status"].tolist() == ["failed"]
+    assert "raised IndexError" in table["message"][0]
+    assert table["t_end"][0] < 0.3
+
+
 def test_a_run_that_starts_later_fails_at_its_own_start() -> None:
     with pytest.raises(ControllerError, match=r"at t = 2 s"):
         srm.simulate(load("slider_crank"), 3.0, t0=2.0, controller=mistaken)

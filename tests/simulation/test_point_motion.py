@@ -55,6 +55,33 @@ def test_points_of_the_ground_rest() -> None:
     assert not motion.acceleration.any()
 
 
+def test_pins_of_a_planar_linkage_are_points_by_name() -> None:
+    """Every bar keeps its length: |d|^2 is constant, d d' = 0 and d d'' = -|d'|^2 for its ends."""
+    linkage = srm.planar(
+        points={"O": (0, 0), "A": (40, 0), "B": (120, 80), "C": (150, 0)},
+        bars={"crank": ("O", "A"), "coupler": ("A", "B"), "rocker": ("B", "C")},
+        ground=("O", "C"),
+        unit="mm",
+        mass_per_length=1.0,
+    )
+    solution = srm.simulate(linkage, 0.3, rtol=1e-10, t_eval=np.linspace(0.0, 0.3, 7))
+    ground, A, B, C = (solution.point(name) for name in "OABC")
+    for one, other, length in (
+        (ground, A, 0.04),
+        (A, B, np.hypot(0.08, 0.08)),
+        (B, C, np.hypot(0.03, 0.08)),
+        (ground, C, 0.15),
+    ):
+        gaps = np.linalg.norm(one.position - other.position, axis=1)
+        np.testing.assert_allclose(gaps, length, rtol=1e-9)
+        along, turning = one.position - other.position, one.velocity - other.velocity
+        np.testing.assert_allclose((along * turning).sum(axis=1), 0.0, atol=1e-9)
+        bent = (along * (one.acceleration - other.acceleration)).sum(axis=1)
+        np.testing.assert_allclose(bent, -(turning**2).sum(axis=1), rtol=1e-6, atol=1e-8)
+    np.testing.assert_array_equal(C.velocity, 0.0)
+    assert np.abs(B.velocity).max() > 0.1
+
+
 def test_points_go_on_through_actions_of_events() -> None:
     mechanism = load("four_bar")
     freed = mechanism.without_loop("pin")

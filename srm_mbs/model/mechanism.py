@@ -13,6 +13,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import update_wrapper
+from types import MappingProxyType
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
@@ -67,6 +68,8 @@ class Source:
         Format of the file that held the links and joints.
     reach
         Which files its meshes may be, as the caller who loaded it decided; never saved.
+    parameters
+        Values of the parameters of the description; ``description`` has numbers in their place.
     """
 
     description: str
@@ -77,6 +80,7 @@ class Source:
     gravity: tuple[float, float, float]
     format: str = "URDF"
     reach: Reach = field(default_factory=Reach, compare=False)
+    parameters: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.reach, Reach):
@@ -88,7 +92,8 @@ class Source:
 
     def entries(self) -> dict[str, Any]:
         """The fields that are saved: all but the reach."""
-        return {key.name: getattr(self, key.name) for key in fields(self) if key.name != "reach"}
+        saved = {key.name: getattr(self, key.name) for key in fields(self) if key.name != "reach"}
+        return saved | {"parameters": dict(self.parameters)}
 
     def without_folders(self, text: str) -> str:
         """``text`` of its files or about them, with the files of the model named relative to its
@@ -320,6 +325,11 @@ class MechanismData(ResultOwner):
         q0, v0 = checked_start(self.model, q0, v0)
         object.__setattr__(self, "q0", q0)
         object.__setattr__(self, "v0", v0)
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """Values of the parameters of its description, read-only; empty if it has none."""
+        return MappingProxyType({} if self.source is None else dict(self.source.parameters))
 
     @property
     def constrained(self) -> bool:

@@ -22,7 +22,7 @@ from srm_mbs.formats.toml.description import Description, check_description
 from srm_mbs.formats.toml.parameters import given_parameters, resolved
 from srm_mbs.formats.translation import Options, merged
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
-from srm_mbs.model.mechanism import Source
+from srm_mbs.model.mechanism import Source, variant_maker
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array, name_list
 from srm_mbs.model.reach import Reach
 
@@ -149,11 +149,36 @@ def _of_description(
 ) -> Reading:
     """Read a description; its model file is read from disk unless ``urdf`` is its text."""
     entries, values, notes = resolved(own.toml, overrides.parameters, own.file)
+    given = own
     own = own if entries is own.toml else Document("", own.file)
     description = check_description(entries, own.file)
-    reading = _of_tables(own, entries, description, overrides, reach, urdf)
-    source = replace(reading.source, parameters=values)
-    return replace(reading, source=source, notes=(*reading.notes, *notes))
+    reading, model = _of_tables(own, entries, description, overrides, reach, urdf)
+    return replace(
+        reading,
+        source=replace(reading.source, parameters=values),
+        notes=(*reading.notes, *notes),
+        variants=_Variants(given, overrides, reach, model) if values else None,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Variants:
+    """A description with parameters, and the text of its model file if it names one."""
+
+    own: Document
+    overrides: Overrides
+    reach: Reach
+    model: str | None
+
+    @property
+    def definition(self) -> tuple[Any, ...]:
+        return (self.own.text, self.model, self.overrides)
+
+    def __call__(self, parameters: Mapping[str, Any]) -> Mechanism:
+        values = {**self.overrides.parameters, **given_parameters(parameters)}
+        with naming(file=self.own.file):
+            overrides = replace(self.overrides, parameters=values)
+            return _mechanism(_of_description(self.own, overrides, self.reach, self.model))
 
 
 def _of_tables(
@@ -163,10 +188,11 @@ def _of_tables(
     overrides: Overrides,
     reach: Reach,
     urdf: str | None,
-) -> Reading:
-    """Read what a description, whose tables are checked, consists of or names."""
+) -> tuple[Reading, str | None]:
+    """Read what a description, whose tables are checked, consists of or names; with the text of its
+    model file."""
     if description.planar is not None:
-        return _translated(own, entries, description, LINKAGE, own, overrides, reach)
+        return _translated(own, entries, description, LINKAGE, own, overrides, reach), None
     key, name = description.model_file
     path = Path(own.file).parent / name
     if urdf is not None:
@@ -185,7 +211,16 @@ def _of_tables(
                 remedy=error.remedy if os.path.exists(path) else relative,
             ) from error
     found = of_key(key, path, model)
-    return _translated(own, entries, description, found, model, overrides, reach)
+    reading = _translated(own, entries, description, found, model, overrides, reach)
+    return reading, model.text
+
+
+def _mechanism(reading: Reading) -> Mechanism:
+    """The assembled mechanism, which knows its variants."""
+    with naming(file=reading.source.path):
+        mechanism = assembled(reading)
+    variant_maker.keep(mechanism, reading.variants)
+    return mechanism
 
 
 def _of_file(path: Path, overrides: Overrides) -> Reading:
@@ -320,9 +355,7 @@ def load(
         closing_tolerance,
         given_parameters(parameters),
     )
-    reading = read(path, overrides)
-    with naming(file=reading.source.path):
-        return assembled(reading)
+    return _mechanism(read(path, overrides))
 
 
 LARGEST_N, LARGEST_DENSE_N = 1000, 300

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import update_wrapper
 from types import MappingProxyType
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -171,6 +171,24 @@ class per_start(_Memoised[Owner, Result]):  # noqa: N801 - a decorator
     _store = "_start_results"
 
 
+class VariantMaker(Protocol):
+    """Loads a description again with other values of its parameters."""
+
+    @property
+    def definition(self) -> tuple[Any, ...]:
+        """What determines the variants, whatever file it was read from."""
+
+    def __call__(self, parameters: Mapping[str, Any]) -> Any:
+        """The mechanism with ``parameters``, name -> number."""
+
+
+@per_model
+def variant_maker(mechanism: MechanismData) -> VariantMaker | None:
+    """What makes the variants of a mechanism; None unless the function that loaded it gave one, and
+    where it was changed afterwards."""
+    return None
+
+
 FRICTION_SPEED = 0.01
 """Default of ``friction_speed``, rad/s or m/s."""
 
@@ -310,7 +328,8 @@ class MechanismData(ResultOwner):
     def __getstate__(self) -> dict[str, Any]:
         """The fields, and the motion of the drives, which may have begun before this state."""
         state = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        return state | {"drive_curves": _drive_curves.kept(self)}
+        kept = {"drive_curves": _drive_curves.kept(self), "variant_maker": variant_maker(self)}
+        return state | kept
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._forget()
@@ -318,6 +337,7 @@ class MechanismData(ResultOwner):
             object.__setattr__(self, entry.name, state[entry.name])
         if state["drive_curves"] is not None:
             _drive_curves.keep(self, state["drive_curves"])
+        variant_maker.keep(self, state["variant_maker"])
         for array in (self.q0, self.v0):
             array.setflags(write=False)
 
@@ -330,6 +350,29 @@ class MechanismData(ResultOwner):
     def parameters(self) -> Mapping[str, float]:
         """Values of the parameters of its description, read-only; empty if it has none."""
         return MappingProxyType({} if self.source is None else dict(self.source.parameters))
+
+    def with_parameters(self, /, **values: float) -> Self:
+        """The mechanism of the same description with other values of its parameters.
+
+        It is loaded anew from the texts that were read, and starts as the description says;
+        parameters that are not given keep the values that this mechanism has.
+
+        Raises
+        ------
+        InputError
+            If it was not loaded from a description with parameters, or was changed afterwards other
+            than by :meth:`with_state`; for a parameter that is unknown or that nothing uses; and as
+            :func:`srm_mbs.load`.
+        """
+        make = variant_maker(self)
+        if make is None:
+            raise InputError(
+                "there is no description with parameters that makes this mechanism",
+                element="with_parameters",
+                remedy="Load a description with [parameters], and change the mechanism after "
+                "with_parameters, not before",
+            )
+        return make(values)  # type: ignore[no-any-return]
 
     @property
     def constrained(self) -> bool:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -104,6 +106,16 @@ def test_a_linkage_with_parameters_is_that_with_the_numbers_typed_in(
     assert same(found, srm.load(linkage))
 
 
+def test_a_variant_is_the_mechanism_loaded_with_its_values(linkage: Path) -> None:
+    found = srm.load(linkage, gravity=[0.0, 0.0, -1.62])
+    wanted = srm.load(linkage, gravity=[0.0, 0.0, -1.62], parameters={"crank": 0.31, "rocker": 0.8})
+    linkage.unlink()  # what was read is what varies
+    copied = pickle.loads(pickle.dumps(found.with_state(found.q0, found.v0)))
+    for origin in (found, copied):
+        assert same(origin.with_parameters(crank=0.31).with_parameters(rocker=0.8), wanted)
+    assert dict(found.parameters) == {"crank": 0.3, "rocker": 0.7}
+
+
 def test_a_parameter_that_nothing_uses_is_noted() -> None:
     entries = {"parameters": {"a": 1.0, "b": 2.0}, "friction_speed": "=a"}
     assert resolved(entries, {}, "a.toml")[2] == ("no expression uses the parameters 'b'",)
@@ -169,6 +181,8 @@ def test_messages_about_parameters(linkage: Path) -> None:
             "value of a text": given({"crank": "long"}),
             "values of a list": given([1.0]),
             "not finite": given({"crank": math.nan}),
+            "variant without description": load("four_bar").with_parameters,
+            "variant of a changed mechanism": replace(srm.load(linkage), forces=()).with_parameters,
             "command line": partial(parameter_values, ["crank"]),
             "command line twice": partial(parameter_values, ["a=1", "a=2"]),
         },

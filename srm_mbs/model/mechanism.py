@@ -176,7 +176,7 @@ class VariantMaker(Protocol):
 
     @property
     def definition(self) -> tuple[Any, ...]:
-        """What determines the variants, whatever file it was read from."""
+        """The texts and options that determine the variants, for fingerprints."""
 
     def __call__(self, parameters: Mapping[str, Any]) -> Any:
         """The mechanism with ``parameters``, name -> number."""
@@ -184,7 +184,7 @@ class VariantMaker(Protocol):
 
 @per_model
 def variant_maker(mechanism: MechanismData) -> VariantMaker | None:
-    """What makes the variants of a mechanism; None unless the function that loaded it gave one, and
+    """The maker of the variants of a mechanism; None unless the function that loaded it gave one, and
     where it was changed afterwards."""
     return None
 

@@ -184,8 +184,8 @@ class VariantMaker(Protocol):
 
 @per_model
 def variant_maker(mechanism: MechanismData) -> VariantMaker | None:
-    """The maker of the variants of a mechanism; None unless the function that loaded it gave one, and
-    where it was changed afterwards."""
+    """The maker of the variants of a mechanism; None unless the function that loaded it gave one,
+    and where the mechanism was changed afterwards."""
     return None
 
 
@@ -369,7 +369,7 @@ class MechanismData(ResultOwner):
             raise InputError(
                 "there is no description with parameters that makes this mechanism",
                 element="with_parameters",
-                remedy="Load a description with [parameters], and change the mechanism after "
+                remedy="Give srm.load a description with [parameters], and change the result after "
                 "with_parameters, not before",
             )
         return make(values)  # type: ignore[no-any-return]

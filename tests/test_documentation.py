@@ -22,6 +22,7 @@ from PIL import Image
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import closure_errors
 from srm_mbs.formats.toml.description import check_description, parse_toml
+from srm_mbs.formats.toml.parameters import resolved
 from tools import plot_pictures, singular_pictures
 from tools.method_tables import filled
 from tools.singular_pictures import by_scipy
@@ -114,7 +115,7 @@ def fragments() -> list[tuple[str, str]]:
 @pytest.mark.parametrize(("page", "text"), fragments())
 def test_the_tables_of_descriptions_on_a_page_are_valid(page: str, text: str) -> None:
     entries = parse_toml('format = 1\nurdf = "x.urdf"\n' + text, page)
-    description = check_description(entries, page)
+    description = check_description(resolved(entries, {}, page)[0], page)
     found = len(description.loop) + len(description.drive) + len(description.force)
     assert found == text.count("[[")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import wraps
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 import srm_mbs
-from srm_mbs.cli.output import AllowOutside, option
+from srm_mbs.cli.output import AllowOutside, option, several
 from srm_mbs.errors import InputError
 
 if TYPE_CHECKING:
@@ -45,6 +45,10 @@ ClosingTolerance = Annotated[
         "implied to it are left out.",
     ),
 ]
+Parameters = Annotated[
+    list[str] | None,
+    several("--set", "NAME=VALUE", "Value of a parameter of a description."),
+]
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,7 @@ class ModelFile:
     keyframe: Keyframe = None
     massless: Massless = None
     closing_tolerance: ClosingTolerance = None
+    parameters: Parameters = None
 
     def options(self) -> dict[str, Any]:
         """The options as ``srm_mbs.load`` takes them.
@@ -63,13 +68,15 @@ class ModelFile:
         Raises
         ------
         InputError
-            If ``--massless`` is neither ``fix`` nor two numbers.
+            If ``--massless`` is neither ``fix`` nor two numbers, or ``--set`` no name with a
+            number.
         """
         return {
             "allow_outside": self.allow_outside,
             "keyframe": self.keyframe,
             "massless": massless_ends(self.massless),
             "closing_tolerance": self.closing_tolerance,
+            "parameters": parameter_values(self.parameters or ()),
         }
 
     def load(self, **more: Any) -> Mechanism:
@@ -96,6 +103,33 @@ def massless_ends(given: str | None) -> str | dict[str, float] | None:
             remedy="Give fix, or mass and moment of inertia as 0.1,1e-4 (kg, kg m^2)",
         ) from error
     return {"mass": mass, "inertia": inertia}
+
+
+def parameter_values(given: Sequence[str]) -> dict[str, float]:
+    """The texts ``NAME=VALUE`` of ``--set`` as ``srm_mbs.load`` takes them.
+
+    Raises
+    ------
+    InputError
+        If one is none, or names a parameter again.
+    """
+    values: dict[str, float] = {}
+    for text in given:
+        name, _, value = text.partition("=")
+        try:
+            number = float(value)
+        except ValueError as error:
+            raise InputError(
+                f"{text!r} is not a name and a number",
+                element="set",
+                remedy="Give it as crank=0.3",
+            ) from error
+        if name in values:
+            raise InputError(
+                f"the parameter {name!r} is given twice", element="set", remedy="Keep one"
+            )
+        values[name] = number
+    return values
 
 
 def reads_model(command: Callable[..., None]) -> Callable[..., None]:

@@ -33,7 +33,7 @@ from srm_mbs.formats.xml import parse_xml
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.coordinates import write_position, write_rate
 from srm_mbs.model.forces import ForceElement, Wrench
-from srm_mbs.model.mechanism import SimulationDefaults, Source
+from srm_mbs.model.mechanism import SimulationDefaults, Source, VariantMaker
 from srm_mbs.model.validation import check_inertia, massless_ends, undetermined_joint
 
 log = get_logger(__name__)
@@ -184,6 +184,8 @@ class Reading:
         Of the assembled mechanism (:attr:`~srm_mbs.formats.translation.Translation.check`).
     kind
         The class of the mechanism.
+    variants
+        Reads it again with other values of its parameters; None without parameters.
     """
 
     description: Description
@@ -193,6 +195,7 @@ class Reading:
     notes: tuple[str, ...] = ()
     check: Callable[[Mechanism], None] | None = None
     kind: type[Mechanism] = Mechanism
+    variants: VariantMaker | None = None
 
 
 def unassembled(

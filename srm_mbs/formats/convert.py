@@ -17,6 +17,7 @@ from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, naming
 from srm_mbs.formats.build import Reading, unassembled
 from srm_mbs.formats.files import checked_path, write_texts
 from srm_mbs.formats.load import Overrides, read
+from srm_mbs.formats.toml.parameters import given_parameters
 from srm_mbs.model.numbers import flag, name_list
 from srm_mbs.model.reach import Reach
 
@@ -34,6 +35,7 @@ def convert(
     keyframe: str | None = None,
     massless: str | Mapping[str, float] | None = None,
     closing_tolerance: float | None = None,
+    parameters: Mapping[str, float] | None = None,
 ) -> tuple[Path, Path, tuple[str, ...]]:
     """Write a mechanism of any format as a TOML description, and its tree as a URDF beside it.
 
@@ -41,7 +43,7 @@ def convert(
 
     Parameters
     ----------
-    path, cut, mesh_dirs, allow_outside, keyframe, massless, closing_tolerance
+    path, cut, mesh_dirs, allow_outside, keyframe, massless, closing_tolerance, parameters
         As for :func:`srm_mbs.load`.
     out
         The description to write, ``.toml``; the URDF gets the same name with ``.urdf``.
@@ -67,6 +69,7 @@ def convert(
         keyframe=keyframe,
         massless=massless,
         closing_tolerance=closing_tolerance,
+        parameters=given_parameters(parameters),
     )
     return write_description(read(path, overrides), target, inputs=(path,), force=force)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from numbers import Integral
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,10 @@ from srm_mbs.formats.build import Reading, assembled
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.registry import DESCRIPTION, LINKAGE, Format, find_format, of_key
 from srm_mbs.formats.toml.description import Description, check_description
+from srm_mbs.formats.toml.parameters import given_parameters, resolved
 from srm_mbs.formats.translation import Options, merged
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
-from srm_mbs.model.mechanism import Source
+from srm_mbs.model.mechanism import Source, variant_maker
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array, name_list
 from srm_mbs.model.reach import Reach
 
@@ -52,7 +53,8 @@ class Overrides:
 
     ``gravity``, ``base`` and ``cut`` replace values of the file (None or empty: the file's);
     so do ``massless`` and ``closing_tolerance`` (None: the file's).  ``keyframe`` names one of its
-    states; ``mesh_dirs`` and ``allow_outside`` say which other files it may name.
+    states; ``mesh_dirs`` and ``allow_outside`` say which other files it may name;
+    ``parameters`` are values of parameters of a description.
     """
 
     gravity: Sequence[float] | None = None
@@ -63,6 +65,7 @@ class Overrides:
     keyframe: str | None = None
     massless: str | Mapping[str, float] | None = None
     closing_tolerance: float | None = None
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
     def entries(self) -> dict[str, Any]:
         """Those that are keys of a description, which a saved run and a conversion keep."""
@@ -145,9 +148,51 @@ def _of_description(
     own: Document, overrides: Overrides, reach: Reach, urdf: str | None = None
 ) -> Reading:
     """Read a description; its model file is read from disk unless ``urdf`` is its text."""
-    description = check_description(own.toml, own.file)
+    entries, values, notes = resolved(own.toml, overrides.parameters, own.file)
+    given = own
+    own = own if entries is own.toml else Document("", own.file)
+    description = check_description(entries, own.file)
+    reading, model = _of_tables(own, entries, description, overrides, reach, urdf)
+    return replace(
+        reading,
+        source=replace(reading.source, parameters=values),
+        notes=(*reading.notes, *notes),
+        variants=_Variants(given, overrides, reach, model) if values else None,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Variants:
+    """A description with parameters, and the text of its model file if it names one."""
+
+    own: Document
+    overrides: Overrides
+    reach: Reach
+    model: str | None
+
+    @property
+    def definition(self) -> tuple[Any, ...]:
+        return (self.own.text, self.model, self.overrides)
+
+    def __call__(self, parameters: Mapping[str, Any]) -> Mechanism:
+        values = {**self.overrides.parameters, **given_parameters(parameters)}
+        with naming(file=self.own.file):
+            overrides = replace(self.overrides, parameters=values)
+            return _mechanism(_of_description(self.own, overrides, self.reach, self.model))
+
+
+def _of_tables(
+    own: Document,
+    entries: Mapping[str, Any],
+    description: Description,
+    overrides: Overrides,
+    reach: Reach,
+    urdf: str | None,
+) -> tuple[Reading, str | None]:
+    """Read what a description, whose tables are checked, consists of or names; with the text of its
+    model file."""
     if description.planar is not None:
-        return _translated(own, own.toml, description, LINKAGE, own, overrides, reach)
+        return _translated(own, entries, description, LINKAGE, own, overrides, reach), None
     key, name = description.model_file
     path = Path(own.file).parent / name
     if urdf is not None:
@@ -166,7 +211,16 @@ def _of_description(
                 remedy=error.remedy if os.path.exists(path) else relative,
             ) from error
     found = of_key(key, path, model)
-    return _translated(own, own.toml, description, found, model, overrides, reach)
+    reading = _translated(own, entries, description, found, model, overrides, reach)
+    return reading, model.text
+
+
+def _mechanism(reading: Reading) -> Mechanism:
+    """The assembled mechanism, which knows its variants."""
+    with naming(file=reading.source.path):
+        mechanism = assembled(reading)
+    variant_maker.keep(mechanism, reading.variants)
+    return mechanism
 
 
 def _of_file(path: Path, overrides: Overrides) -> Reading:
@@ -177,6 +231,12 @@ def _of_file(path: Path, overrides: Overrides) -> Reading:
     found = find_format(path, document)
     if found is DESCRIPTION:
         return _of_description(document, overrides, reach)
+    if overrides.parameters:
+        raise InputError(
+            f"a {found.name} has no parameters",
+            element="parameters",
+            remedy="Give a TOML description with [parameters]",
+        )
     entries = {"format": 1, "urdf": path.name}
     own = Document(tomli_w.dumps(entries), document.file)
     description = check_description(entries, own.file)
@@ -238,6 +298,7 @@ def load(
     keyframe: str | None = None,
     massless: str | Mapping[str, float] | None = None,
     closing_tolerance: float | None = None,
+    parameters: Mapping[str, float] | None = None,
 ) -> Mechanism:
     """Load a mechanism and assemble its initial state.
 
@@ -272,6 +333,9 @@ def load(
         Accuracy (m, rad) of the data of overconstrained loops that do not close exactly: closure
         rows that the others imply to this tolerance, along the motion too, are left out, and a note
         names them.  By default such loops are an error that names the residual.
+    parameters
+        Values of parameters of a description instead of those of its table ``[parameters]``,
+        name -> number.
 
     Raises
     ------
@@ -289,10 +353,9 @@ def load(
         keyframe,
         massless,
         closing_tolerance,
+        given_parameters(parameters),
     )
-    reading = read(path, overrides)
-    with naming(file=reading.source.path):
-        return assembled(reading)
+    return _mechanism(read(path, overrides))
 
 
 LARGEST_N, LARGEST_DENSE_N = 1000, 300

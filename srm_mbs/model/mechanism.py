@@ -13,7 +13,8 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import update_wrapper
-from typing import Any, Generic, Self, TypeVar
+from types import MappingProxyType
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -67,6 +68,8 @@ class Source:
         Format of the file that held the links and joints.
     reach
         Which files its meshes may be, as the caller who loaded it decided; never saved.
+    parameters
+        Values of the parameters of the description; ``description`` has numbers in their place.
     """
 
     description: str
@@ -77,6 +80,7 @@ class Source:
     gravity: tuple[float, float, float]
     format: str = "URDF"
     reach: Reach = field(default_factory=Reach, compare=False)
+    parameters: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.reach, Reach):
@@ -88,7 +92,8 @@ class Source:
 
     def entries(self) -> dict[str, Any]:
         """The fields that are saved: all but the reach."""
-        return {key.name: getattr(self, key.name) for key in fields(self) if key.name != "reach"}
+        saved = {key.name: getattr(self, key.name) for key in fields(self) if key.name != "reach"}
+        return saved | {"parameters": dict(self.parameters)}
 
     def without_folders(self, text: str) -> str:
         """``text`` of its files or about them, with the files of the model named relative to its
@@ -164,6 +169,24 @@ class per_start(_Memoised[Owner, Result]):  # noqa: N801 - a decorator
     """Decorator: evaluate a function of a mechanism once for each initial state."""
 
     _store = "_start_results"
+
+
+class VariantMaker(Protocol):
+    """Loads a description again with other values of its parameters."""
+
+    @property
+    def definition(self) -> tuple[Any, ...]:
+        """The texts and options that determine the variants, for fingerprints."""
+
+    def __call__(self, parameters: Mapping[str, Any]) -> Any:
+        """The mechanism with ``parameters``, name -> number."""
+
+
+@per_model
+def variant_maker(mechanism: MechanismData) -> VariantMaker | None:
+    """The maker of the variants of a mechanism; None unless the function that loaded it gave one,
+    and where the mechanism was changed afterwards."""
+    return None
 
 
 FRICTION_SPEED = 0.01
@@ -305,7 +328,8 @@ class MechanismData(ResultOwner):
     def __getstate__(self) -> dict[str, Any]:
         """The fields, and the motion of the drives, which may have begun before this state."""
         state = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        return state | {"drive_curves": _drive_curves.kept(self)}
+        kept = {"drive_curves": _drive_curves.kept(self), "variant_maker": variant_maker(self)}
+        return state | kept
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._forget()
@@ -313,6 +337,7 @@ class MechanismData(ResultOwner):
             object.__setattr__(self, entry.name, state[entry.name])
         if state["drive_curves"] is not None:
             _drive_curves.keep(self, state["drive_curves"])
+        variant_maker.keep(self, state["variant_maker"])
         for array in (self.q0, self.v0):
             array.setflags(write=False)
 
@@ -320,6 +345,34 @@ class MechanismData(ResultOwner):
         q0, v0 = checked_start(self.model, q0, v0)
         object.__setattr__(self, "q0", q0)
         object.__setattr__(self, "v0", v0)
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """Values of the parameters of its description, read-only; empty if it has none."""
+        return MappingProxyType({} if self.source is None else dict(self.source.parameters))
+
+    def with_parameters(self, /, **values: float) -> Self:
+        """The mechanism of the same description with other values of its parameters.
+
+        It is loaded anew from the texts that were read, and starts as the description says;
+        parameters that are not given keep the values that this mechanism has.
+
+        Raises
+        ------
+        InputError
+            If it was not loaded from a description with parameters, or was changed afterwards other
+            than by :meth:`with_state`; for a parameter that is unknown or that nothing uses; and as
+            :func:`srm_mbs.load`.
+        """
+        make = variant_maker(self)
+        if make is None:
+            raise InputError(
+                "there is no description with parameters that makes this mechanism",
+                element="with_parameters",
+                remedy="Give srm.load a description with [parameters], and change the result after "
+                "with_parameters, not before",
+            )
+        return make(values)  # type: ignore[no-any-return]
 
     @property
     def constrained(self) -> bool:

@@ -101,6 +101,7 @@ class SourceEntry(StrictData):
     base: Literal["fixed", "floating", "planar"]
     gravity: Annotated[list[Number], Field(min_length=3, max_length=3)]
     format: Name = "URDF"
+    parameters: Annotated[dict[Name, Number], Field(max_length=MOST_ELEMENTS)] = Field({})
 
 
 class DefaultsEntry(StrictData):

@@ -10,6 +10,7 @@ import numpy as np
 
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.model.mechanism import variant_maker
 from srm_mbs.model.numbers import plain
 
 STARTS = ("q0", "v0", "q", "v")
@@ -42,11 +43,22 @@ class Case:
         return f"cases[{safe_repr(self.name)}]"
 
 
-def listed(source: Mechanism | Callable[..., Any], cases: Any, *, free: bool) -> tuple[Case, ...]:
+def varied(source: Mechanism | Callable[..., Any]) -> tuple[str, ...]:
+    """Names of the parameters of a description that cases of ``source`` may vary."""
+    if not isinstance(source, Mechanism) or variant_maker(source) is None:
+        return ()
+    return tuple(name for name in source.parameters if name not in STARTS)
+
+
+def listed(
+    source: Mechanism | Callable[..., Any], cases: Any, columns: Any = None, *, free: bool
+) -> tuple[Case, ...]:
     """``cases`` in order, checked.
 
     Parameters
     ----------
+    columns
+        Further parameters of the cases, name -> a value for each; ``cases`` may then be None.
     free
         Whether parameters of any name are allowed for a given mechanism.
 
@@ -55,7 +67,9 @@ def listed(source: Mechanism | Callable[..., Any], cases: Any, *, free: bool) ->
     InputError
         If there are no cases, or one of them, which the message names, is malformed.
     """
-    if isinstance(cases, Mapping):
+    if cases is None and columns is not None:
+        found = _from_columns(columns)
+    elif isinstance(cases, Mapping):
         found = _from_mapping(cases)
     elif isinstance(cases, Iterable) and not isinstance(cases, str | bytes):
         try:
@@ -64,6 +78,8 @@ def listed(source: Mechanism | Callable[..., Any], cases: Any, *, free: bool) ->
             found = []
     else:
         found = []
+    if cases is not None and columns is not None:
+        found = _joined(found, _from_columns(columns))
     out = []
     for index, (name, parameters) in enumerate(found):
         case = Case(index, name, parameters)
@@ -73,7 +89,7 @@ def listed(source: Mechanism | Callable[..., Any], cases: Any, *, free: bool) ->
                 element=case.where,
                 remedy="Give a dictionary: name of a parameter -> value",
             )
-        _check_names(case, isinstance(source, Mechanism), free)
+        _check_names(case, source, free)
         out.append(Case(index, name, {plain(k): value for k, value in parameters.items()}))
     if not out:
         raise InputError(
@@ -84,7 +100,7 @@ def listed(source: Mechanism | Callable[..., Any], cases: Any, *, free: bool) ->
     return tuple(out)
 
 
-def _from_mapping(cases: Mapping[Any, Any]) -> list[tuple[int | str, Any]]:
+def _from_mapping(cases: Mapping[Any, Any], element: str = "cases") -> list[tuple[int | str, Any]]:
     """Named cases, or the rows of columns."""
     if all(isinstance(value, Mapping) for value in cases.values()):
         return [(_label(name), cases[name]) for name in cases]
@@ -96,11 +112,53 @@ def _from_mapping(cases: Mapping[Any, Any]) -> list[tuple[int | str, Any]]:
     if len(lengths) < len(cases) or len(set(lengths.values())) != 1:
         raise InputError(
             f"the columns have the lengths {lengths}" if lengths else "these are not columns",
-            element="cases",
+            element=element,
             remedy="Give every parameter an array with one entry, or row, per case",
         )
     count = next(iter(lengths.values()))
     return [(k, {name: values[k] for name, values in columns.items()}) for k in range(count)]
+
+
+def _from_columns(columns: Any) -> list[tuple[int | str, Any]]:
+    """The rows of ``parameters``."""
+    if not isinstance(columns, Mapping) or not columns:
+        raise InputError(
+            f"parameters = {safe_repr(columns)} are not columns",
+            element="parameters",
+            remedy="Give a dictionary: name of a parameter -> a value for each case",
+        )
+    for name in columns:
+        if name in STARTS:
+            raise InputError(
+                f"{safe_repr(name)} is the start of a case, not a parameter of its mechanism",
+                element="parameters",
+                remedy="Give it in the cases, or rename the parameter",
+            )
+    return _from_mapping(columns, "parameters")
+
+
+def _joined(
+    cases: list[tuple[int | str, Any]], rows: list[tuple[int | str, Any]]
+) -> list[tuple[int | str, Any]]:
+    """The cases, each with the parameters of its row."""
+    if len(cases) != len(rows):
+        raise InputError(
+            f"there are {len(cases)} cases and {len(rows)} values of each parameter",
+            element="parameters",
+            remedy="Give every parameter a value for each case",
+        )
+    out = []
+    for (name, case), (_, more) in zip(cases, rows):
+        if isinstance(case, Mapping):
+            if twice := [key for key in more if key in case]:
+                raise InputError(
+                    f"{safe_repr(twice[0])} is given in the cases as well",
+                    element="parameters",
+                    remedy="Keep one of the two",
+                )
+            case = {**case, **more}
+        out.append((name, case))
+    return out
 
 
 def _label(name: Any) -> int | str:
@@ -113,7 +171,7 @@ def _label(name: Any) -> int | str:
         return safe_repr(name)
 
 
-def _check_names(case: Case, mechanism_given: bool, free: bool) -> None:
+def _check_names(case: Case, source: Mechanism | Callable[..., Any], free: bool) -> None:
     names = set(case.parameters)
     if reserved := sorted(names & set(RESERVED)):
         raise InputError(
@@ -121,15 +179,16 @@ def _check_names(case: Case, mechanism_given: bool, free: bool) -> None:
             element=case.where,
             remedy="Give the parameter another name",
         )
-    if not mechanism_given:
+    if not isinstance(source, Mechanism):
         return
-    unknown = sorted(names - set(STARTS))
+    own = varied(source)
+    unknown = sorted(names - {*STARTS, *own})
     if unknown and not free:
         raise InputError(
             f"a given mechanism has no parameter {safe_repr(unknown[0])}",
             element=case.where,
-            remedy=f"Give {', '.join(STARTS)}; for others a function that makes the mechanism "
-            "of a case instead of the mechanism, or options=",
+            remedy=f"Give {', '.join((*STARTS, *own))}; for others a function that makes the "
+            "mechanism of a case instead of the mechanism, or options=",
         )
     if names & {"q", "v"} and names & {"q0", "v0"}:
         raise InputError(

@@ -12,11 +12,13 @@ import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, cast
 
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError, __version__, printable
 from srm_mbs.formats.files import checked_path, read_bytes
-from srm_mbs.sweeps.cases import Case
+from srm_mbs.model.mechanism import variant_maker
+from srm_mbs.sweeps.cases import Case, varied
 from srm_mbs.sweeps.fingerprint import fingerprint
 from srm_mbs.sweeps.tasks import Outcome, Task
 
@@ -58,12 +60,16 @@ class Journal:
         self._keys = _keys(cases)
         self.known: dict[int, Outcome] = {}
         # Fingerprints of everything that determines the results.
-        parts = {
+        parts: dict[str, Any] = {
             "mechanism": task.source,
             "t_end": task.t_end,
             "measure": task.measure,
             "options": [task.options, task.simulate_options],
         }
+        names = varied(task.source)
+        if any(name in case.parameters for case in cases for name in names):
+            variants = variant_maker(cast(Mechanism, task.source))
+            parts["parameters"] = None if variants is None else variants.definition
         sweep = {name: _checked_fingerprint(value, name) for name, value in parts.items()}
         head = {"format": FORMAT, "version": __version__, "sweep": sweep}
         try:

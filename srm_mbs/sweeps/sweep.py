@@ -53,6 +53,7 @@ def sweep(
     executor: Executor | None = None,
     chunk: int = 1,
     resume: str | Path | None = None,
+    parameters: Mapping[str, Any] | None = None,
     progress: bool | Counted = False,
     **simulate_options: Any,
 ) -> Sweep:
@@ -69,7 +70,9 @@ def sweep(
         mapping of columns, parameter -> array with an entry or a row per case.  For a given
         mechanism the parameters are ``q0`` (nq,) and ``v0`` (nv,), a consistent state, or ``q`` and
         ``v`` as for :func:`srm_mbs.assemble`, joint -> value, from which the case is assembled;
-        unspecified rates are those of least norm.
+        unspecified rates are those of least norm.  Parameters of its description
+        (``mechanism.parameters``) may be among them: the case then runs on the mechanism of
+        ``mechanism.with_parameters``.  None if ``parameters`` has the cases.
     t_end
         End of the runs (s).
     measure
@@ -87,6 +90,9 @@ def sweep(
     resume
         A file to which every finished case is appended; the cases that it already has are read
         instead of being run.  Cases that raised an exception are repeated.
+    parameters
+        Further parameters of the cases as columns, name -> a value for each case; with ``cases``
+        None they are the cases.
     progress
         True for a bar (on a terminal only), or a function of (done, total), called after each case.
     **simulate_options
@@ -134,7 +140,7 @@ def sweep(
     _check_options(simulate_options)
     if isinstance(simulate_options.get("events"), Iterator):  # read once, used by every run
         simulate_options["events"] = list(simulate_options["events"])
-    given = listed(mechanism, cases, free=options is not None)
+    given = listed(mechanism, cases, parameters, free=options is not None)
     _, t_end = checked_span(simulate_options.get("t0", 0.0), t_end)
     task = Task(mechanism, t_end, measure, options, simulate_options)
     if isinstance(mechanism, Mechanism):

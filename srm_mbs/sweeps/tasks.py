@@ -16,7 +16,7 @@ from srm_mbs.assembly.assemble import assemble
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError, SimulationError, printable, safe_repr
 from srm_mbs.simulation.result import check_run
-from srm_mbs.sweeps.cases import RESERVED, STARTS
+from srm_mbs.sweeps.cases import RESERVED, STARTS, varied
 
 Value = bool | int | float | str | None
 Measure = Callable[[Solution], Mapping[str, Any]]
@@ -110,11 +110,13 @@ class Task:
             made = self.source(**parameters)
             mechanism, more = made if isinstance(made, tuple) else (made, {})
             return mechanism, chosen | more
+        values = {name: parameters[name] for name in varied(self.source) if name in parameters}
+        source = self.source.with_parameters(**values) if values else self.source
         start = {name: parameters[name] for name in STARTS if name in parameters}
         if "q" in start or "v" in start:
-            state = assemble(self.source, **start)
+            state = assemble(source, **start)
             start = {"q0": state.q, "v0": state.v}
-        return self.source, chosen | start
+        return source, chosen | start
 
 
 def _partial_if_failed(mechanism: Mechanism, t_end: float, options: dict[str, Any]) -> Solution:

@@ -99,6 +99,22 @@ class Call:
         return self.function(*given, **{k: changes.get(k, v) for k, v in self.named.items()})
 
 
+def with_a_parameter(folder: Path) -> srm.Mechanism:
+    """A bar that hangs from a pin, the place of which is a parameter."""
+    path = folder / "bar.toml"
+    path.write_text(
+        """format = 1
+parameters = { pin = 0.2 }
+[planar]
+points = { O = ["=pin", 0], A = [1, 0] }
+bar = [{ name = "bar", points = ["O", "A"], mass = 1 }]
+ground = ["O"]
+""",
+        encoding="utf-8",
+    )
+    return srm.load(path)
+
+
 def calls(folder: Path) -> dict[str, Call]:
     """A call of every public function, and of the methods of results; they write to ``folder``."""
     four_bar = srm.load("four_bar")
@@ -261,6 +277,9 @@ def calls(folder: Path) -> dict[str, Call]:
         "Linearisation.mode_shape": Call(found.mode_shape, (0,)),
         "FollowedPath.motion": Call(path.motion, (1.0,)),
         "JointMotion": Call(srm.JointMotion, (four_bar, np.array([0.0, 1.0]), np.array([q, q]))),
+        "Mechanism.with_parameters": Call(
+            with_a_parameter(folder).with_parameters, (), {"pin": 0.3}
+        ),
         "Mechanism.with_state": Call(four_bar.with_state, (q, v)),
         "Mechanism.joint": Call(four_bar.joint, (crank,)),
     }

@@ -540,3 +540,72 @@ def test_throughput_is_measured_on_equal_rows() -> None:
     ]
     assert rows[0].of_serial == 1.0
     assert all(row.runs_per_second > 0.0 for row in rows)
+
+
+HANGING = """format = 1
+parameters = { length = 1.0, mass = 1.0 }
+[planar]
+points = { O = [0, 0], A = ["=length", 0] }
+bar = [{ name = "rod", points = ["O", "A"], mass = "=mass" }]
+ground = ["O"]
+rates = { O = 0.5 }
+"""
+
+
+@pytest.fixture
+def rod(tmp_path: Path) -> srm.Mechanism:
+    path = tmp_path / "rod.toml"
+    path.write_text(HANGING, encoding="utf-8")
+    return srm.load(path)
+
+
+def test_a_sweep_over_parameters_equals_single_runs_on_every_executor(
+    rod: srm.Mechanism, processes: Executor
+) -> None:
+    lengths = [0.5, 0.0, 1.5]  # a bar without length cannot be
+    columns = {"length": lengths}
+    cases = [{"v": {"O": 0.1 * k}} for k in range(3)]
+    wanted = []
+    for case, length in zip(cases, lengths):
+        if length:
+            variant = rod.with_parameters(length=length)
+            state = srm.assemble(variant, v=case["v"])
+            wanted.append(states(srm.simulate(variant, 0.5, q0=state.q, v0=state.v)))
+    with ThreadPoolExecutor(2) as threads:
+        for executor in (None, threads, processes):
+            sweep = srm.sweep(
+                rod, cases, 0.5, measure=states, parameters=columns, executor=executor
+            )
+            assert [failure.index for failure in sweep.failures] == [1]
+            for k, single in zip((0, 2), wanted):
+                for name in single.keys() - {"process"}:
+                    assert sweep.table[name][k] == single[name]
+
+
+def test_a_sweep_over_parameters_resumes_the_same_description_only(
+    rod: srm.Mechanism, tmp_path: Path
+) -> None:
+    journal, lengths = tmp_path / "journal", {"length": [0.5, 1.5]}
+    first = srm.sweep(rod, None, 0.2, parameters={"length": [0.5]}, resume=journal)
+    again = srm.sweep(rod, None, 0.2, parameters=lengths, resume=journal)
+    assert again.resumed == 1
+    assert again.table["steps"][0] == first.table["steps"][0]
+    path = tmp_path / "other.toml"
+    path.write_text(HANGING.replace("=length", "=length**2"), encoding="utf-8")
+    with pytest.raises(srm.InputError, match="differs in parameters"):
+        srm.sweep(srm.load(path), None, 0.2, parameters=lengths, resume=journal)
+
+
+def test_messages_about_swept_parameters(rod: srm.Mechanism) -> None:
+    cases = [{"v": {"O": 0.1}}]
+    check_refusals(
+        "sweep_parameters",
+        {
+            "unknown": lambda: srm.sweep(rod, None, 1.0, parameters={"lenght": [1.0]}),
+            "start": lambda: srm.sweep(rod, None, 1.0, parameters={"q0": [1.0]}),
+            "no columns": lambda: srm.sweep(rod, None, 1.0, parameters={"length": 1.0}),
+            "no dictionary": lambda: srm.sweep(rod, cases, 1.0, parameters=3),  # type: ignore[arg-type]
+            "counts": lambda: srm.sweep(rod, cases, 1.0, parameters={"length": [1.0, 2.0]}),
+            "twice": lambda: srm.sweep(rod, [{"length": 1.0}], 1.0, parameters={"length": [1.0]}),
+        },
+    )

@@ -316,6 +316,7 @@ class TopEntry(StrictEntry):
     sdf: StrictStr | None = None
     mjcf: StrictStr | None = None
     planar: PlanarEntry | None = None
+    parameters: dict[StrictStr, Number] = {}
     cut: list[StrictStr] = []
     base: Base = "fixed"
     gravity: Vector = [0.0, 0.0, -9.81]

@@ -1,0 +1,324 @@
+"""Parameters of a description, and arithmetic over them wherever a number stands.
+
+A text that begins with ``=`` is an expression.  It is parsed by :mod:`ast` and evaluated node by
+node, in floating point only: nothing but the operators, functions and constants listed here exists,
+so that the file of a stranger can neither call Python nor make it compute without end.
+"""
+
+from __future__ import annotations
+
+import ast
+import keyword
+import math
+import operator
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from srm_mbs.errors import InputError, known_names, safe_repr
+from srm_mbs.formats.files import shortened
+from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_number, named_values
+
+LONGEST_EXPRESSION = 200
+"""Characters of an expression, which bound how deep it is nested."""
+MOST_PARAMETERS = 1000
+"""Parameters of a description."""
+DEEPEST_CHAIN = 50
+"""Parameters of which each is an expression over the next."""
+PARAMETERS = "parameters"
+"""Key of the table of parameters."""
+
+BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: math.pow,
+}
+UNARY: Mapping[type[ast.unaryop], Callable[[float], float]] = {
+    ast.UAdd: operator.pos,
+    ast.USub: operator.neg,
+}
+CONSTANTS: Mapping[str, float] = {"pi": math.pi}
+FUNCTIONS: Mapping[str, tuple[Callable[..., float], int, int]] = {
+    "sqrt": (math.sqrt, 1, 1),
+    "sin": (math.sin, 1, 1),
+    "cos": (math.cos, 1, 1),
+    "tan": (math.tan, 1, 1),
+    "atan2": (math.atan2, 2, 2),
+    "abs": (abs, 1, 1),
+    "min": (min, 2, LONGEST_EXPRESSION),
+    "max": (max, 2, LONGEST_EXPRESSION),
+    "radians": (math.radians, 1, 1),
+    "degrees": (math.degrees, 1, 1),
+}
+"""Functions of expressions with their least and largest number of arguments; angles in rad."""
+
+
+def is_expression(value: Any) -> bool:
+    """Whether ``value`` of a description is an expression."""
+    return isinstance(value, str) and value.startswith("=")
+
+
+def resolved(
+    entries: Mapping[str, Any], given: Mapping[str, float], file: str
+) -> tuple[Mapping[str, Any], dict[str, float], tuple[str, ...]]:
+    """A description with numbers in place of its expressions, and without its parameters.
+
+    Parameters
+    ----------
+    entries
+        The tables of the description, as ``tomllib`` gives them; they are left as they are.
+    given
+        Values instead of those of the file.
+
+    Returns
+    -------
+    entries, values, notes
+        The same object if it has neither expressions nor parameters; the values of all parameters;
+        a note about those that nothing uses.
+
+    Raises
+    ------
+    InputError
+        Naming file, key, expression and remedy; also for a value of a parameter that is unknown or
+        that nothing uses.
+    """
+    try:
+        known = _Parameters(entries.get(PARAMETERS, {}), given)
+        rest = {key: value for key, value in entries.items() if key != PARAMETERS}
+        numbers = {key: known.in_place(value, key) for key, value in rest.items()}
+        values = known.values()
+    except InputError as error:
+        error.file = error.file or file
+        raise
+    idle = [name for name in values if name not in known.used]
+    for name in given:
+        if name in idle:
+            raise InputError(
+                f"nothing in the description uses the parameter {name!r}",
+                file=file,
+                element=f"{PARAMETERS}.{name}",
+                remedy=f'Use it in an expression, as "={name}", or leave its value out',
+            )
+    if not known.changed and PARAMETERS not in entries:
+        return entries, {}, ()
+    names = ", ".join(map(repr, idle))
+    notes = (f"no expression uses the parameters {names}",) if idle else ()
+    return numbers, values, notes
+
+
+class _Parameters:
+    """The parameters of a description, evaluated when they are first used."""
+
+    def __init__(self, table: Any, given: Mapping[str, float]) -> None:
+        if not isinstance(table, dict):
+            raise InputError(
+                f"a table is wanted, not {shortened(safe_repr(table))}",
+                element=PARAMETERS,
+                remedy="Write [parameters] above lines of the form crank = 0.268",
+            )
+        if len(table) > MOST_PARAMETERS:
+            raise InputError(
+                f"there are more than {MOST_PARAMETERS} parameters",
+                element=PARAMETERS,
+                remedy="Remove some",
+            )
+        for name in table:
+            if not name.isidentifier() or keyword.iskeyword(name) or name in _RESERVED:
+                raise InputError(
+                    f"{name!r} cannot be the name of a parameter",
+                    element=PARAMETERS,
+                    remedy="Give a name of letters, digits and _, other than that of a function "
+                    "or constant",
+                )
+        for name in given:
+            if name not in table:
+                raise InputError(
+                    f"there is no parameter {safe_repr(name)}",
+                    element=PARAMETERS,
+                    remedy=known_names(table),
+                )
+        self._table: dict[str, Any] = {**table, **given}
+        self._values: dict[str, float] = {}
+        self._open: list[str] = []
+        self.used: set[str] = set()
+        self.changed = False
+
+    def values(self) -> dict[str, float]:
+        """All values, in the order of the file."""
+        return {name: self._value(name) for name in self._table}
+
+    def in_place(self, value: Any, key: str) -> Any:
+        """``value`` of ``key`` with numbers in place of its expressions."""
+        if is_expression(value):
+            self.changed = True
+            return self._evaluated(value, key)
+        if isinstance(value, dict):
+            return {name: self.in_place(part, f"{key}.{name}") for name, part in value.items()}
+        if isinstance(value, list):
+            return [self.in_place(part, f"{key}[{i}]") for i, part in enumerate(value)]
+        return value
+
+    def _value(self, name: str) -> float:
+        """The value of a parameter that there is."""
+        if name not in self._values:
+            key = f"{PARAMETERS}.{name}"
+            if name in self._open:
+                circle = " -> ".join([*self._open[self._open.index(name) :], name])
+                raise InputError(
+                    f"the parameters depend on each other: {circle}",
+                    element=key,
+                    remedy="Give one of them a number",
+                )
+            if len(self._open) >= DEEPEST_CHAIN:
+                raise InputError(
+                    f"more than {DEEPEST_CHAIN} parameters are defined each by the next",
+                    element=key,
+                    remedy="Give one of them a number",
+                )
+            self._open.append(name)
+            self._values[name] = self._defined(self._table[name], key)
+            self._open.pop()
+        return self._values[name]
+
+    def _defined(self, value: Any, key: str) -> float:
+        if is_expression(value):
+            return self._evaluated(value, key)
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not abs(value) <= LARGEST_MAGNITUDE:
+            raise InputError(
+                f"a finite number is wanted, not {shortened(safe_repr(value))}",
+                element=key,
+                remedy='Give a number, or an expression such as "=2*crank"',
+            )
+        return float(value)
+
+    def _evaluated(self, text: str, key: str) -> float:
+        """The value of the expression ``text`` of ``key``."""
+        shown = repr(shortened(text))
+        if len(text) > LONGEST_EXPRESSION:
+            raise InputError(
+                f"the expression {shown} has more than {LONGEST_EXPRESSION} characters",
+                element=key,
+                remedy="Split it into several parameters",
+            )
+        try:
+            body = ast.parse(text[1:].strip(), mode="eval").body
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+            raise InputError(
+                f"{shown} is not an expression",
+                element=key,
+                remedy='Write arithmetic, as "=2*crank" or "=sqrt(a**2 + b**2)"',
+            ) from error
+        try:
+            value = self._node(body, shown, key)
+        except ArithmeticError as error:
+            raise _no_value(shown, key) from error
+        except ValueError as error:
+            if isinstance(error, InputError):
+                raise
+            raise _no_value(shown, key) from error
+        if not abs(value) <= LARGEST_MAGNITUDE:
+            raise _no_value(shown, key)
+        return value
+
+    def _node(self, node: ast.expr, shown: str, key: str) -> float:
+        """The value of a node of the expression that messages show as ``shown``."""
+        match node:
+            case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
+                return float(number)
+            case ast.Name(id=name) if name in CONSTANTS:
+                return CONSTANTS[name]
+            case ast.Name(id=name) if name in FUNCTIONS:
+                raise InputError(
+                    f"in {shown} the function {name} has no arguments",
+                    element=key,
+                    remedy=f"Write {name}(...)",
+                )
+            case ast.Name(id=name):
+                if name not in self._table:
+                    raise InputError(
+                        f"in {shown} there is no parameter {name!r}",
+                        element=key,
+                        remedy=known_names(self._table),
+                    )
+                self.used.add(name)
+                return self._value(name)
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in BINARY:
+                return BINARY[type(op)](self._node(left, shown, key), self._node(right, shown, key))
+            case ast.UnaryOp(op=sign, operand=operand) if type(sign) in UNARY:
+                return UNARY[type(sign)](self._node(operand, shown, key))
+            case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
+                values = [self._node(each, shown, key) for each in arguments]
+                return self._call(name, values, shown, key)
+        power = isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitXor)
+        raise InputError(
+            f"{shown} has something else than arithmetic",
+            element=key,
+            remedy="Write ** for powers"
+            if power
+            else f"Use numbers, parameters, + - * / ** ( ), and {', '.join(_RESERVED)}",
+        )
+
+    @staticmethod
+    def _call(name: str, arguments: list[float], shown: str, key: str) -> float:
+        if name not in FUNCTIONS:
+            raise InputError(
+                f"in {shown} there is no function {shortened(name)!r}",
+                element=key,
+                remedy=known_names(FUNCTIONS),
+            )
+        function, least, most = FUNCTIONS[name]
+        if not least <= len(arguments) <= most:
+            wanted = f"{least}" if least == most else f"at least {least}"
+            raise InputError(
+                f"in {shown} the function {name} has {len(arguments)} arguments",
+                element=key,
+                remedy=f"Give it {wanted}",
+            )
+        return float(function(*arguments))
+
+
+_RESERVED = (*CONSTANTS, *FUNCTIONS)
+
+
+def _no_value(shown: str, key: str) -> InputError:
+    return InputError(
+        f"{shown} has no finite value of sensible size",
+        element=key,
+        remedy="Correct the expression or the values of its parameters",
+    )
+
+
+def given_parameters(values: Any) -> dict[str, float]:
+    """``values``, name -> number, as :func:`srm_mbs.load` takes them.
+
+    Raises
+    ------
+    InputError
+        If they are anything else.
+    """
+    out = {}
+    for name, value in named_values(values, PARAMETERS).items():
+        if not isinstance(name, str):
+            raise InputError(
+                f"{safe_repr(name)} is not the name of a parameter",
+                element=PARAMETERS,
+                remedy="Give a dictionary: name -> value",
+            )
+        shown = safe_repr(name)
+        if isinstance(value, bool | str):
+            raise InputError(
+                f"the parameter {shown} = {safe_repr(value)} is not a finite number",
+                element=PARAMETERS,
+                remedy="Give a finite number",
+            )
+        number = finite_number(value, f"the parameter {shown}", PARAMETERS)
+        if abs(number) > LARGEST_MAGNITUDE:
+            raise InputError(
+                f"the parameter {shown} = {number!r} is not a number of sensible size",
+                element=PARAMETERS,
+                remedy="Give a finite number of sensible size",
+            )
+        out[name] = number
+    return out

@@ -138,6 +138,24 @@ def test_the_residual_of_a_critical_configuration_is_the_difference_of_the_bars(
     assert abs(found.residual) * geometry.units.length == pytest.approx(abs(d), abs=4e-16)
 
 
+@pytest.mark.parametrize("ahead", [0.1, 0.02, 0.004])
+def test_the_critical_configuration_of_loops_that_are_singular_at_once_is_found(
+    ahead: float,
+) -> None:
+    """All 20 loops pass together: any combination of their critical rows is critical."""
+    mechanism = load("n_four_bar_20")
+    solution = srm.simulate(mechanism, 1.0, rtol=1e-10)
+    (passage,) = solution.crossings
+    geometry = geometry_of(mechanism, mechanism.q0)
+    near, at = (solution(passage.time - time)[0] for time in (ahead, 0.0))
+
+    found = critical_configuration(geometry, mechanism.structure.rank, near, 0.6)
+
+    assert found is not None
+    assert abs(found.residual) < 1e-15
+    np.testing.assert_allclose(geometry.difference(at, found.q), 0.0, atol=1e-8)
+
+
 @pytest.mark.parametrize("rtol", [1e-4, 1e-8, 1e-12])
 def test_a_residual_below_the_tolerance_counts_as_zero_at_every_accuracy(rtol: float) -> None:
     almost, equal = slider_crank(1e-10), slider_crank(0.0)

@@ -187,10 +187,11 @@ private:
         }
     }
 
-    // u: the combination of the rows that is smallest, by inverse iteration.
+    // u: the combination of the rows that is smallest, by inverse iteration from one that has a part
+    // in each row.
     bool start() {
-        u_.assign(rank_, 0.0);
-        u_[rank_ - 1] = 1.0;
+        u_.resize(rank_);
+        for (int i = 0; i < rank_; ++i) u_[i] = std::cos(1.0 + i);
         std::vector<double> gram(static_cast<std::size_t>(rank_) * rank_);
         double trace = 0.0;
         for (int i = 0; i < rank_; ++i) {
@@ -263,7 +264,9 @@ private:
         for (int i = 0; i < rank_; ++i) {
             double* row = &matrix[(n_ + i) * size];
             std::copy_n(&G_[i * n_], n_, row);
-            row[n_ + i] = -delta_;
+            // Combinations that are critical together, as those of loops that are singular at once,
+            // stay what they are.
+            row[n_ + i] = -delta_ - constants_.critical_ridge;
             row[n_ + rank_] = -u_[i];
             matrix[(n_ + rank_) * size + n_ + i] = u_[i];
         }

@@ -37,8 +37,9 @@ ACCEPTED = 1e-11
 FROZEN = 1e-3
 """Newton step (units) from which on the Hessian is not evaluated again."""
 RIDGE = 1e-5
-"""Added to the Hessian: configurations that are critical together, such as those of a free base,
-stay where they are."""
+"""Added to the Hessian, and taken from its counterpart for u: configurations that are critical
+together, such as those of a free base, and combinations that are, such as those of loops that are
+singular at once, stay where they are."""
 LARGEST_DEVIATION = 0.5
 """Distance of a configuration from its hyperbola, over that from the critical configuration, from
 which it is not beside that one."""
@@ -152,7 +153,7 @@ def critical_configuration(
         matrix = np.block(
             [
                 [H, G.T, none],
-                [G, -delta * np.eye(structural_rank), -u[:, None]],
+                [G, -(delta + RIDGE) * np.eye(structural_rank), -u[:, None]],
                 [none.T, u[None], np.zeros((1, 1))],
             ]
         )

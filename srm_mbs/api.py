@@ -125,7 +125,8 @@ class Solution(AnimationMixin, SimulationResult):
             ``point``: anchors such as ``srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))``, or names of
             points of the mechanism.  ``x`` of ``state``, ``reactions`` and ``point``: joint on the
             horizontal axis instead of time; ``unit``: its unit, ``"rad"`` or ``"deg"``, ``"m"`` or
-            ``"mm"``.  Of every kind ``title``: the title; ``size``: width and height (inch).
+            ``"mm"``.  Of every kind ``title``: the title; ``size``: ``"column"`` (3.5 inch wide),
+            ``"page"`` (7 inch) or width and height (inch); ``dpi``: dots per inch of a png.
 
         Returns
         -------
@@ -182,7 +183,8 @@ class DaeSolution(DaeResult):
         kind
             ``run``: drift, sigma and step sizes.  ``state``: states and multipliers.
         **options
-            ``title``: the title; ``size``: width and height (inch).
+            ``title``: the title; ``size``: ``"column"`` (3.5 inch wide), ``"page"`` (7 inch) or
+            width and height (inch); ``dpi``: dots per inch of a png.
 
         Raises
         ------

@@ -81,7 +81,14 @@ def plot(
     ] = None,
     size: Annotated[
         str | None,
-        option("WIDTH,HEIGHT", "Size of the picture (inch).", show_default="that of the kind"),
+        option(
+            "column|page|WIDTH,HEIGHT",
+            "Size of the picture (inch): 3.5 wide for a column, 7 for a page.",
+            show_default="that of the kind",
+        ),
+    ] = None,
+    dpi: Annotated[
+        float | None, option("N", "Dots per inch of a .png.", show_default="200")
     ] = None,
 ) -> None:
     """Draw a picture of a saved run."""
@@ -97,7 +104,8 @@ def plot(
         "x": x,
         "unit": unit,
         "title": title,
-        "size": None if size is None else size.split(","),
+        "size": size.split(",") if size and "," in size else size,
+        "dpi": dpi,
     }
     options = {name: value for name, value in wanted.items() if value}
     check_options(kind, options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from functools import partial
 from pathlib import Path
@@ -12,6 +13,7 @@ import pinocchio as pin
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 import srm_mbs as srm
 from srm_mbs.api import Solution
@@ -142,6 +144,8 @@ def test_plots_that_cannot_be_drawn_are_refused(
         "an axis of a run plot": (slider_crank, {"x": "crank"}),
         "a size of one number": (slider_crank, {"size": 7.0}),
         "a size of nothing": (slider_crank, {"size": (7.0, 0.0)}),
+        "a size by an unknown name": (slider_crank, {"size": "poster"}),
+        "a resolution of nothing": (slider_crank, {"dpi": 0}),
         "a title that is no text": (slider_crank, {"title": 7}),
         "an unknown point": (slider_crank, {"kind": "point", "points": ["C"]}),
         "one point": (slider_crank, {"kind": "path", "points": srm.Anchor("rod")}),
@@ -463,6 +467,55 @@ def test_titles_and_sizes_may_be_chosen(slider_crank: Solution, dae: srm.DaeSolu
         assert figure.get_size_inches().tolist() == [8.0, 3.5]
 
 
+def inches(path: Path) -> tuple[float, float]:
+    """Width and height of a picture, as its file says."""
+    if path.suffix == ".png":
+        with Image.open(path) as picture:
+            return tuple(np.array(picture.size) / picture.info["dpi"])
+    text = path.read_bytes().decode("latin-1")
+    pattern = r'width="([\d.]+)pt" height="([\d.]+)pt"'
+    if path.suffix == ".pdf":
+        pattern = r"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]"
+    width, height = re.search(pattern, text).groups()
+    return float(width) / 72.0, float(height) / 72.0
+
+
+def test_files_have_the_width_of_a_column_or_page_and_their_text_as_text(
+    slider_crank: Solution, tmp_path: Path
+) -> None:
+    point = [srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))]
+    for suffix in ("png", "pdf", "svg"):
+        for size, width in (("column", 3.5), ("page", 7.0), ((5.0, 2.5), 5.0)):
+            path = tmp_path / f"path.{suffix}"
+            slider_crank.plot(path, kind="path", points=point, size=size, dpi=150, title="Rod")
+            assert inches(path)[0] == pytest.approx(width, abs=0.01)
+    assert inches(path)[1] == pytest.approx(2.5, abs=0.01)
+    assert re.search(r"<text[^>]*>Rod<", path.read_text())
+    fonts = path.with_suffix(".pdf").read_bytes()
+    assert b"/FontFile2" in fonts
+    assert b"/Type3" not in fonts
+    with Image.open(path.with_suffix(".png")) as picture:
+        assert picture.size == (750, 375)
+    with pytest.raises(srm.InputError, match="would have 240000 by 240000 pixels"):
+        slider_crank.plot(path.with_suffix(".png"), size=(100.0, 100.0), dpi=2400)
+
+
+@pytest.mark.parametrize("kind", ["run", "state", "reactions"])
+def test_nothing_of_a_plot_for_a_column_overlaps_or_leaves_the_picture(
+    slider_crank: Solution, kind: str
+) -> None:
+    figure = slider_crank.plot(kind=kind, size="column")
+    figure.draw_without_rendering()
+    frame = figure.bbox
+    for axes in figure.axes:
+        title, legend = axes._left_title.get_window_extent(), axes.get_legend()
+        texts = [*legend.get_texts()] if legend else []
+        for box in [title, *(text.get_window_extent() for text in texts)]:
+            assert frame.x0 <= box.x0
+            assert box.x1 <= frame.x1
+        assert not any(title.overlaps(text.get_window_extent()) for text in texts)
+
+
 # -- sigma ------------------------------------------------------------------------------------
 
 
@@ -655,7 +708,7 @@ def test_small_values_have_their_power_of_ten_in_the_label() -> None:
 def test_the_run_of_a_dae_has_drift_sigma_and_steps(dae: srm.DaeSolution) -> None:
     figure = dae.plot()
     drift, sigma, steps = figure.axes
-    assert figure.get_suptitle() == "index-2 DAE, PSRM, auto, rtol = 1e-06"
+    assert figure.get_suptitle() == "index-2 DAE"
     assert steps.get_xlabel() == "time"
     g = [abs(problem_two().g(t, x)) for t, x in zip(dae.t, dae.x)]
     np.testing.assert_allclose(drawn(drift)[1], np.maximum(g, 1e-17))

@@ -24,6 +24,7 @@ from srm_mbs.visualization.plotting.figure import (
 from srm_mbs.visualization.plotting.joints import draw_phase, draw_state
 from srm_mbs.visualization.plotting.path import draw_path
 from srm_mbs.visualization.plotting.points import draw_points
+from srm_mbs.visualization.plotting.poses import draw_poses
 from srm_mbs.visualization.plotting.print_size import (
     check_pixels,
     checked_resolution,
@@ -53,6 +54,7 @@ KINDS: Kinds = {
     "phase": draw_phase,
     "path": draw_path,
     "point": draw_points,
+    "poses": draw_poses,
 }
 """Those of a run of a mechanism."""
 

@@ -161,13 +161,14 @@ def plane_normal(mechanism: Mechanism) -> tuple[float, ...] | None:
     """
     model = mechanism.model
     data = workspace(model)
-    jacobian = pin.computeJointJacobians(model, data, np.array(mechanism.q0))
+    # Pinocchio returns a single column as a vector.
+    columns = pin.computeJointJacobians(model, data, np.array(mechanism.q0)).reshape(6, model.nv)
     turns, slides = [], []
     for joint in range(1, model.njoints):
         first, count = model.joints[joint].idx_v, model.joints[joint].nv
         # Columns of spatial velocities about the origin of the world.
         for linear, angular in (
-            np.split(column, 2) for column in jacobian[:, first : first + count].T
+            np.split(column, 2) for column in columns[:, first : first + count].T
         ):
             if np.any(angular):
                 turns.append(angular)

@@ -124,6 +124,28 @@ def test_a_film_has_the_length_of_the_run_over_its_speed(tmp_path: Path) -> None
 
 
 @pytest.mark.browser
+def test_the_pictures_of_a_film_may_be_written_into_a_folder(tmp_path: Path) -> None:
+    from PIL import Image
+
+    solution, folder, done = run(), tmp_path / "frames", []
+    solution.export_video(
+        folder, fps=2.0, size=(450, 300), progress=lambda count, _: done.append(count)
+    )
+    names = [f"frame_{k:05d}.png" for k in range(1, 5)]  # 0 to 1.5 s
+    assert sorted(path.name for path in folder.iterdir()) == names
+    assert done == [1, 2, 3, 4]
+    for k in (0, 2):
+        image = np.asarray(Image.open(folder / names[k]).convert("RGB")) / 255.0
+        expected = seen_at(solution, bob(solution, 0.5 * k), 2.0, (450, 300))
+        np.testing.assert_allclose(orange_at(image), expected, atol=3.0)
+    with pytest.raises(srm.InputError, match="the folder is not empty"):
+        solution.export_video(folder)
+    said = run_command("simulate", "simple_pendulum", "--video", folder, status=2)
+    assert "error: --video: " in said.replace(f"{folder}: ", "")
+    assert "steps" not in said
+
+
+@pytest.mark.browser
 def test_an_mp4_is_written_by_ffmpeg(tmp_path: Path) -> None:
     run().export_video(tmp_path / "film.mp4", fps=10.0, size=(301, 201))
     assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"

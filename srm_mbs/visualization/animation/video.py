@@ -310,7 +310,8 @@ def export_video(
     size
         Width and height in pixels.
     progress
-        True for a progress bar (on a terminal only), or a callable (done, total) after each picture.
+        True for a progress bar (on a terminal only), or a callable (done, total) that is called
+        after each picture.
     drawn
         ``trace``, ``gaps`` and ``reactions`` of
         :func:`srm_mbs.visualization.animation.playback.export_html`.

@@ -34,6 +34,10 @@ log = get_logger(__name__)
 
 SIZE = (900, 600)
 """Width and height of an image in pixels; ratios other than 3 to 2 have margins."""
+PRINT_RESOLUTION = 300.0
+"""Dots per inch of an image whose size is given by a name."""
+LARGEST_SIDE = 8192
+"""Largest width or height in pixels of the canvas of Chromium without a graphics card."""
 FILMS = (".gif", ".mp4")
 FRAME = "frame_{:05d}.png"
 """Names of the pictures of a film in a folder, from 1."""
@@ -241,7 +245,8 @@ def export_image(
     path: str | Path,
     *,
     t: float | None = None,
-    size: tuple[int, int] = SIZE,
+    size: str | tuple[float, float] = SIZE,
+    dpi: float | None = None,
     **drawn: Any,
 ) -> None:
     """Write an image of a run at one time.
@@ -255,7 +260,10 @@ def export_image(
     t
         Time (s) in the run; its end by default.
     size
-        Width and height in pixels.
+        Width and height in pixels; with ``dpi`` in inches.  ``"column"`` (3.5 inch wide) and
+        ``"page"`` (7 inch) are two thirds as high as wide.
+    dpi
+        Dots per inch, for print; 300 with a name of a size.
     drawn
         ``trace``, ``gaps`` and ``reactions`` of
         :func:`srm_mbs.visualization.animation.playback.export_html`.
@@ -279,8 +287,50 @@ def export_image(
             element="t",
             remedy="Give a time of the run",
         )
-    with photographer(solution, size, 60.0, drawn, [t]) as photograph:
-        write_file(path, photograph(t))
+    pixels: Any = size
+    density: float | None = None
+    if dpi is not None or isinstance(size, str):
+        pixels, density = _print(size, dpi)
+    with photographer(solution, pixels, 60.0, drawn, [t]) as photograph:
+        picture = photograph(t)
+    write_file(path, picture if density is None else _with_density(picture, density))
+
+
+def _print(size: Any, dpi: float | None) -> tuple[tuple[int, int], float]:
+    """Pixels of a picture of ``size`` (inch, or a name), and its dots per inch.
+
+    Raises
+    ------
+    InputError
+        If one is not valid, or the picture has more pixels than the browser draws.
+    """
+    # Matplotlib, which this imports, is slow to import.
+    from srm_mbs.visualization.plotting.print_size import (
+        WIDTHS,
+        checked_resolution,
+        checked_size,
+    )
+
+    size = checked_size(size)
+    density = PRINT_RESOLUTION if dpi is None else checked_resolution(dpi)
+    inches = (WIDTHS[size], WIDTHS[size] / 1.5) if isinstance(size, str) else size
+    width, height = (round(side * density) for side in inches)
+    if max(width, height) > LARGEST_SIDE:
+        raise InputError(
+            f"a picture of {width} by {height} pixels is larger than the browser draws",
+            element="dpi",
+            remedy=f"Give a smaller size or fewer dots per inch: up to {LARGEST_SIDE} pixels",
+        )
+    return (width, height), density
+
+
+def _with_density(picture: bytes, density: float) -> bytes:
+    """A PNG that says how many dots are an inch."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.open(io.BytesIO(picture)).save(out, "PNG", dpi=(density, density), optimize=True)
+    return out.getvalue()
 
 
 def export_video(

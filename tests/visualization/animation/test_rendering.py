@@ -107,6 +107,22 @@ def test_a_picture_shows_the_end_by_default_and_no_controls(tmp_path: Path) -> N
 
 
 @pytest.mark.browser
+def test_a_picture_for_print_has_the_size_in_inches(tmp_path: Path) -> None:
+    from PIL import Image
+
+    for options, shape, dpi in (
+        ({"size": "column"}, (1050, 700), 300.0),
+        ({"size": (3.0, 2.0), "dpi": 100}, (300, 200), 100.0),
+    ):
+        image = picture_of(run(), tmp_path / "print.png", t=0.4, **options)
+        with Image.open(tmp_path / "print.png") as picture:
+            assert picture.size == shape
+            assert picture.info["dpi"] == pytest.approx((dpi, dpi), abs=0.1)
+        expected = seen_at(run(), bob(run(), 0.4), 60.0, shape)
+        np.testing.assert_allclose(orange_at(image), expected, atol=3.0)
+
+
+@pytest.mark.browser
 def test_a_film_has_the_length_of_the_run_over_its_speed(tmp_path: Path) -> None:
     from PIL import Image
 

@@ -120,7 +120,7 @@ class Solution(AnimationMixin, SimulationResult):
             joints.
             ``sigma``: sigma, all kinds of steps, and the error estimates.  ``phase``: rate over
             position of joints.  ``path``: paths of points in space.  ``point``: position, velocity
-            and acceleration of points.
+            and acceleration of points.  ``poses``: the mechanism at several times in one picture.
         **options
             ``joints`` of ``state``, ``phase`` and ``reactions``: names, by default as many as fit.
             ``accelerations`` of ``state``: whether to draw them, too.  ``loops`` of ``reactions``:
@@ -128,7 +128,11 @@ class Solution(AnimationMixin, SimulationResult):
             ``point``: anchors such as ``srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))``, or names of
             points of the mechanism.  ``x`` of ``state``, ``reactions`` and ``point``: joint on the
             horizontal axis instead of time; ``unit``: its unit, ``"rad"`` or ``"deg"``, ``"m"`` or
-            ``"mm"``.  Of every kind ``title``: the title; ``size``: width and height (inch).
+            ``"mm"``.  ``at``, ``crank``, ``points``, ``view`` and ``unit`` of ``poses``: times (s),
+            or positions (degrees, m) of the crank; points whose paths are drawn; direction of view;
+            unit of the axes, ``"m"`` or ``"mm"``.  Of every kind ``title``: the title; ``size``:
+            ``"column"`` (3.5 inch wide), ``"page"`` (7 inch) or width and height (inch); ``dpi``:
+            dots per inch of a png.
 
         Returns
         -------
@@ -185,7 +189,8 @@ class DaeSolution(DaeResult):
         kind
             ``run``: drift, sigma and step sizes.  ``state``: states and multipliers.
         **options
-            ``title``: the title; ``size``: width and height (inch).
+            ``title``: the title; ``size``: ``"column"`` (3.5 inch wide), ``"page"`` (7 inch) or
+            width and height (inch); ``dpi``: dots per inch of a png.
 
         Raises
         ------

@@ -18,6 +18,14 @@ FOLDER = Path(__file__).parents[1] / "docs" / "plots"
 PICTURES: dict[str, tuple[str, float, dict[str, Any]]] = {
     "path": ("watt_six_bar", 3.0, {}),
     "reactions": ("n_four_bar_2", 5.0, {}),
+    "poses": (
+        "four_bar",
+        1.2,
+        {
+            **{"at": [0, 60, 120], "crank": "crank", "unit": "mm"},
+            **{"points": [srm.Anchor("coupler", xyz=(1.0, 0.0, 0.6))], "size": (5.0, 4.2)},
+        },
+    ),
     "sigma": ("slider_crank", 10.0, {}),
 }
 """Kind of picture -> mechanism, end of its run (s), options."""

@@ -220,7 +220,7 @@ class LinkageReport:
             self.transmission_angle,
         )
         if file is not None:
-            save(figure, file)
+            save(figure, file, "srm_mbs: kinematics over a turn of the crank")
         return figure
 
 

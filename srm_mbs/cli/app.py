@@ -262,7 +262,7 @@ def simulate(
             (csv, partial(solution.to_csv, points=added)),
             (html, partial(solution.export_html, **overlays)),
             (image, partial(solution.export_image, t=at, **overlays)),
-            (video, partial(solution.export_video, **overlays)),
+            (video, partial(solution.export_video, progress=True, **overlays)),
         ]
     )
     rows = run_rows(solution, passages=solution.status != "interrupted")

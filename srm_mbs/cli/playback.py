@@ -38,7 +38,10 @@ Image = Annotated[Path | None, option("FILE.png", "Write a picture of the run at
 At = Annotated[
     float | None, option("S", "Time of the picture in the run (s).", show_default="the end")
 ]
-Video = Annotated[Path | None, option("FILE", "Write a film of the run as .gif or .mp4.")]
+Video = Annotated[
+    Path | None,
+    option("FILE", "Write a film of the run as .gif or .mp4, or its pictures into this folder."),
+]
 Trace = Annotated[
     list[str] | None,
     several("--trace", POINT, "Draw the path of a point of a link (m, in the link's frame)."),
@@ -61,7 +64,11 @@ def check_pictures(image: Path | None, at: float | None, video: Path | None) -> 
     InputError
         If one cannot be written, its encoder is missing, or ``at`` is given without an image.
     """
-    from srm_mbs.visualization.animation.video import FILMS, encoder_of
+    from srm_mbs.visualization.animation.video import (
+        FILMS,
+        check_frames_folder,
+        encoder_of,
+    )
 
     check_output(image, "--image", (".png",))
     if image is None and at is not None:
@@ -70,7 +77,9 @@ def check_pictures(image: Path | None, at: float | None, video: Path | None) -> 
             element="--at",
             remedy="Give --image FILE.png too",
         )
-    if video is not None:
+    if video is not None and not video.suffix:
+        check_frames_folder(video, "--video")
+    elif video is not None:
         check_output(video, "--video", FILMS)
         encoder_of(video)
 
@@ -201,7 +210,7 @@ def play(
     written, failed = write_files(
         [
             (image, partial(solution.export_image, t=at, **options)),
-            (video, partial(solution.export_video, **options)),
+            (video, partial(solution.export_video, progress=True, **options)),
         ]
     )
     for path in written:

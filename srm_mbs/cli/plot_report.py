@@ -41,7 +41,8 @@ def plot(
             "KIND",
             "Kind of picture: run (drift, energy, sigma, steps), state (joints over time), "
             "balance (energies and works), reactions, sigma (with all kinds of steps), phase (rate "
-            "over position), path (of points in space), point (their motion over time).",
+            "over position), path (of points in space), point (their motion over time), poses "
+            "(of the mechanism, in one picture).",
         ),
     ] = "run",
     joints: Annotated[
@@ -59,7 +60,7 @@ def plot(
         several(
             "--point",
             POINT,
-            "Draw this point of a link (m, in the link's frame), with path and point.",
+            "Draw this point of a link (m, in the link's frame), with path, point and poses.",
         ),
     ] = None,
     accelerations: Annotated[
@@ -74,14 +75,41 @@ def plot(
         ),
     ] = None,
     unit: Annotated[
-        str | None, option("rad|deg|m|mm", "Unit of that joint.", show_default="rad, m")
+        str | None,
+        option("rad|deg|m|mm", "Unit of that joint, or of poses.", show_default="rad, m"),
+    ] = None,
+    at: Annotated[
+        str | None,
+        option(
+            "T,T,...",
+            "Times (s) of poses; with --crank its positions (degrees, m).",
+            show_default="six, evenly spaced",
+        ),
+    ] = None,
+    crank: Annotated[
+        str | None, typer.Option("--crank", metavar="JOINT", help="Joint of --at, with poses.")
+    ] = None,
+    view: Annotated[
+        str | None,
+        option(
+            "x|y|z|X,Y,Z",
+            "Direction of view, with poses.",
+            show_default="across the plane of motion",
+        ),
     ] = None,
     title: Annotated[
         str | None, option("TEXT", "Title of the picture.", show_default="that of the run")
     ] = None,
     size: Annotated[
         str | None,
-        option("WIDTH,HEIGHT", "Size of the picture (inch).", show_default="that of the kind"),
+        option(
+            "column|page|WIDTH,HEIGHT",
+            "Size of the picture (inch): 3.5 wide for a column, 7 for a page.",
+            show_default="that of the kind",
+        ),
+    ] = None,
+    dpi: Annotated[
+        float | None, option("N", "Dots per inch of a .png.", show_default="200")
     ] = None,
 ) -> None:
     """Draw a picture of a saved run."""
@@ -96,8 +124,12 @@ def plot(
         "accelerations": accelerations,
         "x": x,
         "unit": unit,
+        "at": None if at is None else at.split(","),
+        "crank": crank,
+        "view": view.split(",") if view and "," in view else view,
         "title": title,
-        "size": None if size is None else size.split(","),
+        "size": size.split(",") if size and "," in size else size,
+        "dpi": dpi,
     }
     options = {name: value for name, value in wanted.items() if value}
     check_options(kind, options)

@@ -138,7 +138,9 @@ def progress_bar(system: System, t_end: float) -> Iterator[Tick | None]:
 
 
 @contextmanager
-def counting(progress: bool | Counted, what: str, total: int) -> Iterator[Counted | None]:
+def counting(
+    progress: bool | Counted, what: str, total: int, doing: str = "sweeping"
+) -> Iterator[Counted | None]:
     """The callback after each of ``total`` items: the caller's own, a progress bar, or none."""
     if callable(progress):
         yield progress
@@ -146,5 +148,5 @@ def counting(progress: bool | Counted, what: str, total: int) -> Iterator[Counte
         yield None
     else:
         counted = f"{{task.completed:.0f}} / {{task.total:.0f}} {what}"
-        with _bar("sweeping", counted, total) as draw:
+        with _bar(doing, counted, total) as draw:
             yield None if draw is None else lambda done, _: draw(done, "")

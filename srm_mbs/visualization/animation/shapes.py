@@ -260,22 +260,9 @@ def _skeleton(
     mechanism: Mechanism, loops: Sequence[tuple[LoopClosure, ActiveIntervals | None]]
 ) -> list[Visual]:
     """Bars from each joint to its child joints and loop anchors, with markers there."""
+    ends, masses = bar_ends(mechanism, [loop for loop, _ in loops])
     model = mechanism.model
-    ends: list[list[FloatArray]] = [[] for _ in range(model.njoints)]
-    for joint in range(1, model.njoints):
-        ends[model.parents[joint]].append(model.jointPlacements[joint].translation)
     anchors = [(*side.resolve(model), active) for loop, active in loops for side in loop.anchors]
-    for joint, placement, _ in anchors:
-        ends[joint].append(placement.translation)
-    # The bar of the last body of a chain ends in its centre of mass.
-    masses = [
-        joint
-        for joint in range(1, model.njoints)
-        if not ends[joint] and np.linalg.norm(model.inertias[joint].lever) > 0.0
-    ]
-    for joint in masses:
-        ends[joint].append(model.inertias[joint].lever)
-
     width = BAR_THICKNESS * _extent(mechanism, ends)
     out = []
     for joint in range(1, model.njoints):
@@ -299,6 +286,37 @@ def _skeleton(
         block = Box((2.0 * width,) * 3)
         out.append(Visual(0, pin.SE3(np.eye(3), end), block, GROUND_COLOUR))
     return out
+
+
+def bar_ends(
+    mechanism: Mechanism, loops: Sequence[LoopClosure]
+) -> tuple[list[list[FloatArray]], list[int]]:
+    """Where the bars end that join the origin of each joint to its child joints and to the anchors
+    of ``loops``.
+
+    Returns
+    -------
+    list of lists of (3,) m
+        For each joint, of which 0 is the ground, in its frame.
+    list of int
+        Joints without others and without anchors: their bar ends in the centre of mass.
+    """
+    model = mechanism.model
+    ends: list[list[FloatArray]] = [[] for _ in range(model.njoints)]
+    for joint in range(1, model.njoints):
+        ends[model.parents[joint]].append(model.jointPlacements[joint].translation)
+    for loop in loops:
+        for side in loop.anchors:
+            joint, placement = side.resolve(model)
+            ends[joint].append(placement.translation)
+    masses = [
+        joint
+        for joint in range(1, model.njoints)
+        if not ends[joint] and np.linalg.norm(model.inertias[joint].lever) > 0.0
+    ]
+    for joint in masses:
+        ends[joint].append(model.inertias[joint].lever)
+    return ends, masses
 
 
 def _extent(mechanism: Mechanism, ends: list[list[FloatArray]]) -> float:

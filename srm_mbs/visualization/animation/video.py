@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +23,8 @@ import numpy as np
 
 from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, safe_repr
 from srm_mbs.formats.files import whole_file
+from srm_mbs.simulation.monitoring import Counted, counting
+from srm_mbs.simulation.options import check_progress
 from srm_mbs.visualization.animation.overlays import OverlayOptions
 from srm_mbs.visualization.animation.page import write_file
 from srm_mbs.visualization.animation.playback import check_fps, page_of
@@ -32,7 +34,13 @@ log = get_logger(__name__)
 
 SIZE = (900, 600)
 """Width and height of an image in pixels; ratios other than 3 to 2 have margins."""
+PRINT_RESOLUTION = 300.0
+"""Dots per inch of an image whose size is given by a name."""
+LARGEST_SIDE = 8192
+"""Largest width or height in pixels of the canvas of Chromium without a graphics card."""
 FILMS = (".gif", ".mp4")
+FRAME = "frame_{:05d}.png"
+"""Names of the pictures of a film in a folder, from 1."""
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER_OPTIONS = (
     *("--headless", "--disable-gpu", "--disable-quic", "--no-first-run"),
@@ -237,7 +245,8 @@ def export_image(
     path: str | Path,
     *,
     t: float | None = None,
-    size: tuple[int, int] = SIZE,
+    size: str | tuple[float, float] = SIZE,
+    dpi: float | None = None,
     **drawn: Any,
 ) -> None:
     """Write an image of a run at one time.
@@ -251,7 +260,10 @@ def export_image(
     t
         Time (s) in the run; its end by default.
     size
-        Width and height in pixels.
+        Width and height in pixels; with ``dpi`` in inches.  ``"column"`` (3.5 inch wide) and
+        ``"page"`` (7 inch) are two thirds as high as wide.
+    dpi
+        Dots per inch, for print; 300 with a name of a size.
     drawn
         ``trace``, ``gaps`` and ``reactions`` of
         :func:`srm_mbs.visualization.animation.playback.export_html`.
@@ -275,8 +287,50 @@ def export_image(
             element="t",
             remedy="Give a time of the run",
         )
-    with photographer(solution, size, 60.0, drawn, [t]) as photograph:
-        write_file(path, photograph(t))
+    pixels: Any = size
+    density: float | None = None
+    if dpi is not None or isinstance(size, str):
+        pixels, density = _print(size, dpi)
+    with photographer(solution, pixels, 60.0, drawn, [t]) as photograph:
+        picture = photograph(t)
+    write_file(path, picture if density is None else _with_density(picture, density))
+
+
+def _print(size: Any, dpi: float | None) -> tuple[tuple[int, int], float]:
+    """Pixels of a picture of ``size`` (inch, or a name), and its dots per inch.
+
+    Raises
+    ------
+    InputError
+        If one is not valid, or the picture has more pixels than the browser draws.
+    """
+    # Matplotlib, which this imports, is slow to import.
+    from srm_mbs.visualization.plotting.print_size import (
+        WIDTHS,
+        checked_resolution,
+        checked_size,
+    )
+
+    size = checked_size(size)
+    density = PRINT_RESOLUTION if dpi is None else checked_resolution(dpi)
+    inches = (WIDTHS[size], WIDTHS[size] / 1.5) if isinstance(size, str) else size
+    width, height = (round(side * density) for side in inches)
+    if max(width, height) > LARGEST_SIDE:
+        raise InputError(
+            f"a picture of {width} by {height} pixels is larger than the browser draws",
+            element="dpi",
+            remedy=f"Give a smaller size or fewer dots per inch: up to {LARGEST_SIDE} pixels",
+        )
+    return (width, height), density
+
+
+def _with_density(picture: bytes, density: float) -> bytes:
+    """A PNG that says how many dots are an inch."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.open(io.BytesIO(picture)).save(out, "PNG", dpi=(density, density), optimize=True)
+    return out.getvalue()
 
 
 def export_video(
@@ -286,9 +340,10 @@ def export_video(
     fps: float = 25.0,
     speed: float = 1.0,
     size: tuple[int, int] = (720, 480),
+    progress: bool | Counted = False,
     **drawn: Any,
 ) -> None:
-    """Write a video of a run.
+    """Write a video of a run, or its pictures into a folder.
 
     Parameters
     ----------
@@ -296,13 +351,17 @@ def export_video(
         The run.
     path
         Name of the ``.gif``, which Pillow writes, or ``.mp4``, for which ``ffmpeg`` or the
-        package imageio-ffmpeg must be installed; an existing one is replaced.
+        package imageio-ffmpeg must be installed; an existing one is replaced.  Without a suffix a
+        folder, new or empty, for numbered pictures: ``frame_00001.png`` ...
     fps
         Frames per second of video; browsers play a GIF of more than 50 more slowly.
     speed
         Seconds of the run per second of video.
     size
         Width and height in pixels.
+    progress
+        True for a progress bar (on a terminal only), or a callable (done, total) that is called
+        after each picture.
     drawn
         ``trace``, ``gaps`` and ``reactions`` of
         :func:`srm_mbs.visualization.animation.playback.export_html`.
@@ -310,18 +369,21 @@ def export_video(
     Raises
     ------
     InputError
-        If ``path`` has another suffix or cannot be written, a number is not positive, or Chromium,
-        playwright or ffmpeg is missing.
+        If ``path`` has another suffix, is a folder that is not empty, or cannot be written, a
+        number is not positive, or Chromium, playwright or ffmpeg is missing.
     """
     path = Path(path)
     kind = path.suffix.lower()
     fps = check_fps(fps)
-    if kind not in FILMS:
+    check_progress(progress, "(done, total)")
+    if not kind:
+        check_frames_folder(path, "path")
+    elif kind not in FILMS:
         raise InputError(
             f"films are .gif or .mp4 files, not {path.suffix!r}",
             file=str(path),
             element="path",
-            remedy="Name it .gif or .mp4",
+            remedy="Name it .gif or .mp4, or without a suffix a folder",
         )
     if not (math.isfinite(speed) and speed > 0.0):
         raise InputError(
@@ -329,16 +391,63 @@ def export_video(
             element="speed",
             remedy="Give a positive number: 1 is real time",
         )
-    encoder = encoder_of(path)
+    encoder = encoder_of(path) if kind else None
     start, end = solution.span
     count = max(1, math.floor((end - start) / speed * fps * (1.0 + 1e-12)) + 1)
     times = np.minimum(start + np.arange(count) * (speed / fps), end).tolist()
     with photographer(solution, size, fps / min(speed, 1.0), drawn, times) as photograph:
-        pictures = [photograph(t) for t in times]
+        taken = _photographs(photograph, times, progress)
+        if not kind:
+            _write_frames(path, taken)
+            return
+        pictures = list(taken)
     if encoder is None:
         write_file(path, _gif(pictures, fps))
     else:
         _encode(encoder, pictures, fps, path)
+
+
+def _photographs(
+    photograph: Callable[[float], bytes], times: Sequence[float], progress: bool | Counted
+) -> Iterator[bytes]:
+    with counting(progress, "pictures", len(times), "filming") as report:
+        for done, t in enumerate(times, 1):
+            yield photograph(t)
+            if report is not None:
+                report(done, len(times))
+
+
+def check_frames_folder(folder: Path, element: str) -> None:
+    """Refuse a folder for the pictures of a film that has files, or cannot be made.
+
+    Raises
+    ------
+    InputError
+        About ``element``.
+    """
+    problem, remedy = "", CHECK_WRITING
+    if not folder.parent.is_dir():
+        problem, remedy = f"there is no folder {str(folder.parent)!r}", "Make it first"
+    elif folder.exists() and not folder.is_dir():
+        problem, remedy = "it is a file", "Name a folder, or a .gif or .mp4"
+    elif not os.access(folder if folder.exists() else folder.parent, os.W_OK):
+        problem = "it cannot be written"
+    elif folder.exists() and any(folder.iterdir()):
+        problem, remedy = "the folder is not empty", "Remove its files, or name another folder"
+    if problem:
+        raise InputError(problem, file=str(folder), element=element, remedy=remedy)
+
+
+def _write_frames(folder: Path, pictures: Iterable[bytes]) -> None:
+    """Write each picture when it is taken: an interrupted film keeps those before."""
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"it cannot be written: {error.strerror}", file=str(folder), remedy=CHECK_WRITING
+        ) from error
+    for number, picture in enumerate(pictures, 1):
+        write_file(folder / FRAME.format(number), picture)
 
 
 def encoder_of(film: Path) -> str | None:

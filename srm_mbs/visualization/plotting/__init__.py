@@ -10,17 +10,27 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.formats.files import checked_path
-from srm_mbs.model.numbers import finite_array
 from srm_mbs.visualization.plotting.dae import draw_dae_run, draw_dae_state
 from srm_mbs.visualization.plotting.energy import draw_balance
-from srm_mbs.visualization.plotting.figure import FONT_SIZE, check_suffix, save
+from srm_mbs.visualization.plotting.figure import (
+    FONT_SIZE,
+    RESOLUTION,
+    check_suffix,
+    save,
+    settings_of,
+)
 from srm_mbs.visualization.plotting.joints import draw_phase, draw_state
 from srm_mbs.visualization.plotting.path import draw_path
 from srm_mbs.visualization.plotting.points import draw_points
+from srm_mbs.visualization.plotting.poses import draw_poses
+from srm_mbs.visualization.plotting.print_size import (
+    check_pixels,
+    checked_resolution,
+    checked_size,
+    set_size,
+)
 from srm_mbs.visualization.plotting.reactions import draw_reactions
 from srm_mbs.visualization.plotting.run import draw_run, draw_sigma
 
@@ -44,13 +54,12 @@ KINDS: Kinds = {
     "phase": draw_phase,
     "path": draw_path,
     "point": draw_points,
+    "poses": draw_poses,
 }
 """Those of a run of a mechanism."""
 
-COMMON = ("title", "size")
+COMMON = ("title", "size", "dpi")
 """Options of every kind."""
-LARGEST_SIZE = 100.0
-"""Largest width or height (inch) of a figure."""
 
 DAE_KINDS: Kinds = {"run": draw_dae_run, "state": draw_dae_state}
 """Those of a run of a DAE."""
@@ -81,25 +90,6 @@ def check_options(kind: str, options: Iterable[str] = (), kinds: Kinds = KINDS) 
             )
 
 
-def checked_size(size: Any) -> tuple[float, float]:
-    """Width and height (inch) of a figure.
-
-    Raises
-    ------
-    InputError
-        Unless ``size`` is two positive numbers of at most LARGEST_SIZE.
-    """
-    numbers = finite_array(size, (2,))
-    if numbers is None or not np.all((numbers > 0.0) & (numbers <= LARGEST_SIZE)):
-        raise InputError(
-            f"{safe_repr(size)} is not the size of a figure",
-            element="size",
-            remedy=f"Give width and height in inches, (7.0, 5.0) for example, up to "
-            f"{LARGEST_SIZE:g}",
-        )
-    return float(numbers[0]), float(numbers[1])
-
-
 def plot_solution(
     solution: SimulationResult, path: str | Path | None = None, kind: str = "run", **options: Any
 ) -> Figure:
@@ -121,10 +111,12 @@ def _plot(
     kind: str,
     title: str | None = None,
     size: Any = None,
+    dpi: Any = None,
     **options: Any,
 ) -> Figure:
     check_options(kind, options, kinds)
     inches = None if size is None else checked_size(size)
+    resolution = RESOLUTION if dpi is None else checked_resolution(dpi)
     if title is not None and not isinstance(title, str):
         raise InputError(
             f"{safe_repr(title)} is not a text", element="title", remedy="Give a string"
@@ -135,8 +127,12 @@ def _plot(
     figure = kinds[kind](solution, **options)
     if title is not None:
         figure.suptitle(title, fontsize=FONT_SIZE + 1.5, parse_math=False)
+    # Also without a file: that of savefig, where the figure is saved by its user.
+    figure.set_dpi(resolution)
     if inches is not None:
-        figure.set_size_inches(*inches)
+        set_size(figure, inches)
     if file is not None:
-        save(figure, file)
+        if file.suffix.lower() == ".png":
+            check_pixels(figure)
+        save(figure, file, settings_of(solution))
     return figure

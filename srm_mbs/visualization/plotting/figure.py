@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import (
     FuncFormatter,
@@ -41,6 +42,9 @@ log = get_logger(__name__)
 
 FORMATS = (".png", ".pdf", ".svg")
 """Suffixes under which a figure can be saved."""
+TEXT_AS_TEXT: dict[Any, Any] = {"pdf.fonttype": 42, "svg.fonttype": "none"}
+"""Fonts in a file: journals refuse the Type 3 fonts that are Matplotlib's default in a .pdf, and
+programs can change the letters of an .svg only where they are no outlines."""
 FEW_DECADES = 50.0
 """Below this ratio of its limits a logarithmic axis has ticks within the decades."""
 SMALLEST_LOG_RATIO = 8.0
@@ -130,16 +134,22 @@ def check_suffix(path: Path) -> None:
         )
 
 
-def save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path, about: str) -> None:
     """Write ``figure`` in the format that the suffix of ``path`` names, whole or not at all.
+
+    Text stays text: TrueType fonts in a .pdf, letters in an .svg.  The metadata of the file have
+    the title, and ``about``, the settings of the run.
 
     Raises
     ------
     OSError
         If the file cannot be written.
     """
-    with writing(path) as file:
-        figure.savefig(file, format=path.suffix.lower()[1:], dpi=RESOLUTION)
+    suffix = path.suffix.lower()[1:]
+    title = figure.get_suptitle().replace("\n", " ")
+    metadata = {"Title": title, "Subject" if suffix == "pdf" else "Description": about}
+    with writing(path) as file, rc_context(TEXT_AS_TEXT):
+        figure.savefig(file, format=suffix, dpi=figure.dpi, metadata=metadata)
     log.info("written: %s", path)
 
 
@@ -452,17 +462,22 @@ def finish(figure: Figure, solution: Run, notes: Sequence[str] = ()) -> None:
 
 
 def run_title(solution: Run) -> str:
-    """Mechanism, method, tableau and tolerance; status and end time if the run failed."""
-    settings, unit = solution.settings, " s" if seconds(solution) else ""
+    """Name of the mechanism; status and end time if the run failed."""
     name = solution.mechanism.name if isinstance(solution, SimulationResult) else "index-2 DAE"
+    if solution.success:
+        return name
+    unit = " s" if seconds(solution) else ""
+    return f"{name}\n{solution.status} at t = {solution.span[1]:.6g}{unit}"
+
+
+def settings_of(solution: Run) -> str:
+    """Method, tableau, and tolerance or step of a run, for the metadata of a file."""
+    settings, unit = solution.settings, " s" if seconds(solution) else ""
     control = f"rtol = {settings.rtol:.3g}"
     if settings.step is not None:
         control = f"fixed step {settings.step:.6g}{unit}"
-    parts = [name, settings.method, settings.tableau, control]
-    title = ", ".join(part for part in parts if part)
-    if not solution.success:
-        title += f"\n{solution.status} at t = {solution.span[1]:.6g}{unit}"
-    return title
+    parts = [settings.method, settings.tableau, control]
+    return "srm_mbs: " + ", ".join(part for part in parts if part)
 
 
 def seconds(solution: Run) -> str:

@@ -15,6 +15,7 @@ from srm_mbs.dynamics.scaling import is_angle
 from srm_mbs.visualization.plotting.figure import (
     ANGLE_STEPS,
     FONT_SIZE,
+    RESOLUTION,
     TICK_STEPS,
     WIDTH,
     Lines,
@@ -58,7 +59,7 @@ def draw_linkage(
     if transmission_angle is not None:
         shown = {"transmission angle": np.degrees(transmission_angle)}
         panels.append((shown, "angle ", "deg", "transmission angle"))
-    figure = Figure(figsize=(WIDTH, 0.7 + 1.65 * len(panels)), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 0.7 + 1.65 * len(panels)), layout="constrained", dpi=RESOLUTION)
     rows = list(figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0])
     x = np.degrees(positions) if turning else positions
     for letter, axes, (lines, name, unit, title) in zip(string.ascii_lowercase, rows, panels):

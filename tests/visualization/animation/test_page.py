@@ -503,6 +503,8 @@ def test_animations_that_cannot_be_made_are_refused(
         "an image after the end": partial(image, "a.png", t=1.6),
         "an image at no time": partial(image, "a.png", t=math.nan),
         "an image without width": partial(image, "a.png", size=(0, 10)),
+        "an image of no known size": partial(image, "a.png", size="poster"),
+        "an image too large for print": partial(image, "a.png", size="page", dpi=2000),
         "a film without frames": partial(film, "film.gif", fps=0.0),
         "a film without speed": partial(film, "film.gif", speed=0.0),
         "a film of infinite speed": partial(film, "film.gif", speed=math.inf),

@@ -107,6 +107,22 @@ def test_a_picture_shows_the_end_by_default_and_no_controls(tmp_path: Path) -> N
 
 
 @pytest.mark.browser
+def test_a_picture_for_print_has_the_size_in_inches(tmp_path: Path) -> None:
+    from PIL import Image
+
+    for options, shape, dpi in (
+        ({"size": "column"}, (1050, 700), 300.0),
+        ({"size": (3.0, 2.0), "dpi": 100}, (300, 200), 100.0),
+    ):
+        image = picture_of(run(), tmp_path / "print.png", t=0.4, **options)
+        with Image.open(tmp_path / "print.png") as picture:
+            assert picture.size == shape
+            assert picture.info["dpi"] == pytest.approx((dpi, dpi), abs=0.1)
+        expected = seen_at(run(), bob(run(), 0.4), 60.0, shape)
+        np.testing.assert_allclose(orange_at(image), expected, atol=3.0)
+
+
+@pytest.mark.browser
 def test_a_film_has_the_length_of_the_run_over_its_speed(tmp_path: Path) -> None:
     from PIL import Image
 
@@ -121,6 +137,28 @@ def test_a_film_has_the_length_of_the_run_over_its_speed(tmp_path: Path) -> None
         assert len(waits) == 7
         # Seven pictures from 0 to 0.5 s of film, the last one shown as long as the others.
         assert sum(waits) == pytest.approx(1000.0 * 7 / 12.0, abs=10.0)
+
+
+@pytest.mark.browser
+def test_the_pictures_of_a_film_may_be_written_into_a_folder(tmp_path: Path) -> None:
+    from PIL import Image
+
+    solution, folder, done = run(), tmp_path / "frames", []
+    solution.export_video(
+        folder, fps=2.0, size=(450, 300), progress=lambda count, _: done.append(count)
+    )
+    names = [f"frame_{k:05d}.png" for k in range(1, 5)]  # 0 to 1.5 s
+    assert sorted(path.name for path in folder.iterdir()) == names
+    assert done == [1, 2, 3, 4]
+    for k in (0, 2):
+        image = np.asarray(Image.open(folder / names[k]).convert("RGB")) / 255.0
+        expected = seen_at(solution, bob(solution, 0.5 * k), 2.0, (450, 300))
+        np.testing.assert_allclose(orange_at(image), expected, atol=3.0)
+    with pytest.raises(srm.InputError, match="the folder is not empty"):
+        solution.export_video(folder)
+    said = run_command("simulate", "simple_pendulum", "--video", folder, status=2)
+    assert "error: --video: " in said.replace(f"{folder}: ", "")
+    assert "steps" not in said
 
 
 @pytest.mark.browser

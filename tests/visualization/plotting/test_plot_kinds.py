@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from functools import partial
 from pathlib import Path
@@ -12,11 +13,13 @@ import pinocchio as pin
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 import srm_mbs as srm
 from srm_mbs.api import Solution
 from srm_mbs.visualization.plotting import KINDS, joints, sampling
 from srm_mbs.visualization.plotting import figure as style
+from srm_mbs.visualization.plotting.poses import plane_normal
 from tests.support.bundled import load
 from tests.support.commands import error_line, run
 from tests.support.daes import START_TWO, problem_two, solution_two
@@ -107,7 +110,7 @@ def test_unfinished_runs_are_drawn_as_far_as_they_went(kind: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_runs_of_several_segments_are_drawn_whole(kind: str, let_go: Solution) -> None:
     figure = let_go.plot(kind=kind)
-    if kind not in ("phase", "path"):
+    if kind not in ("phase", "path", "poses"):
         assert figure.axes[-1].get_xlim()[1] > 1.2
         assert 0.8 in np.round(marked_times(figure.axes[-1]), 6)
 
@@ -142,6 +145,8 @@ def test_plots_that_cannot_be_drawn_are_refused(
         "an axis of a run plot": (slider_crank, {"x": "crank"}),
         "a size of one number": (slider_crank, {"size": 7.0}),
         "a size of nothing": (slider_crank, {"size": (7.0, 0.0)}),
+        "a size by an unknown name": (slider_crank, {"size": "poster"}),
+        "a resolution of nothing": (slider_crank, {"dpi": 0}),
         "a title that is no text": (slider_crank, {"title": 7}),
         "an unknown point": (slider_crank, {"kind": "point", "points": ["C"]}),
         "one point": (slider_crank, {"kind": "path", "points": srm.Anchor("rod")}),
@@ -149,6 +154,21 @@ def test_plots_that_cannot_be_drawn_are_refused(
         "an unknown link": (slider_crank, {"kind": "path", "points": [srm.Anchor("rood")]}),
         "a point of the ground": (slider_crank, {"kind": "path", "points": [ground]}),
         "no point that moves": (failed, {"kind": "path", "points": [coupler]}),
+        "a time of a pose outside the run": (slider_crank, {"kind": "poses", "at": [4.0]}),
+        "a pose that is no time": (slider_crank, {"kind": "poses", "at": "late"}),
+        "no poses": (slider_crank, {"kind": "poses", "at": []}),
+        "an angle that the crank does not pass": (
+            slider_crank,
+            {"kind": "poses", "at": [90.0], "crank": "crank"},
+        ),
+        "a crank without positions": (slider_crank, {"kind": "poses", "crank": "crank"}),
+        "a crank of six degrees of freedom": (
+            ring,
+            {"kind": "poses", "at": [0.0], "crank": ring.mechanism.joint_names[0]},
+        ),
+        "an unknown direction": (slider_crank, {"kind": "poses", "view": "w"}),
+        "a direction of nothing": (slider_crank, {"kind": "poses", "view": (0, 0, 0)}),
+        "poses in inches": (slider_crank, {"kind": "poses", "unit": "inch"}),
         "reactions of a DAE": (dae, {"kind": "reactions"}),
     }
     messages = {case: refused(partial(it.plot, **options)) for case, (it, options) in cases.items()}
@@ -463,6 +483,55 @@ def test_titles_and_sizes_may_be_chosen(slider_crank: Solution, dae: srm.DaeSolu
         assert figure.get_size_inches().tolist() == [8.0, 3.5]
 
 
+def inches(path: Path) -> tuple[float, float]:
+    """Width and height of a picture, as its file says."""
+    if path.suffix == ".png":
+        with Image.open(path) as picture:
+            return tuple(np.array(picture.size) / picture.info["dpi"])
+    text = path.read_bytes().decode("latin-1")
+    pattern = r'width="([\d.]+)pt" height="([\d.]+)pt"'
+    if path.suffix == ".pdf":
+        pattern = r"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]"
+    width, height = re.search(pattern, text).groups()
+    return float(width) / 72.0, float(height) / 72.0
+
+
+def test_files_have_the_width_of_a_column_or_page_and_their_text_as_text(
+    slider_crank: Solution, tmp_path: Path
+) -> None:
+    point = [srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))]
+    for suffix in ("png", "pdf", "svg"):
+        for size, width in (("column", 3.5), ("page", 7.0), ((5.0, 2.5), 5.0)):
+            path = tmp_path / f"path.{suffix}"
+            slider_crank.plot(path, kind="path", points=point, size=size, dpi=150, title="Rod")
+            assert inches(path)[0] == pytest.approx(width, abs=0.01)
+    assert inches(path)[1] == pytest.approx(2.5, abs=0.01)
+    assert re.search(r"<text[^>]*>Rod<", path.read_text())
+    fonts = path.with_suffix(".pdf").read_bytes()
+    assert b"/FontFile2" in fonts
+    assert b"/Type3" not in fonts
+    with Image.open(path.with_suffix(".png")) as picture:
+        assert picture.size == (750, 375)
+    with pytest.raises(srm.InputError, match="would have 240000 by 240000 pixels"):
+        slider_crank.plot(path.with_suffix(".png"), size=(100.0, 100.0), dpi=2400)
+
+
+@pytest.mark.parametrize("kind", ["run", "state", "reactions"])
+def test_nothing_of_a_plot_for_a_column_overlaps_or_leaves_the_picture(
+    slider_crank: Solution, kind: str
+) -> None:
+    figure = slider_crank.plot(kind=kind, size="column")
+    figure.draw_without_rendering()
+    frame = figure.bbox
+    for axes in figure.axes:
+        title, legend = axes._left_title.get_window_extent(), axes.get_legend()
+        texts = [*legend.get_texts()] if legend else []
+        for box in [title, *(text.get_window_extent() for text in texts)]:
+            assert frame.x0 <= box.x0
+            assert box.x1 <= frame.x1
+        assert not any(title.overlaps(text.get_window_extent()) for text in texts)
+
+
 # -- sigma ------------------------------------------------------------------------------------
 
 
@@ -649,13 +718,102 @@ def test_small_values_have_their_power_of_ten_in_the_label() -> None:
     assert low < 4.6 < 5.4 < high
 
 
+# -- poses ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def turning() -> Solution:
+    return srm.simulate(load("four_bar"), 1.2)
+
+
+def corners(axes: Axes) -> list[np.ndarray]:
+    """Corners of the outlines of the bodies, in the order in which they are drawn."""
+    return [patch.get_xy()[:-1] for patch in axes.patches if patch.get_edgecolor()[3] > 0.0]
+
+
+def holds(points: np.ndarray, point: np.ndarray) -> bool:
+    return bool(np.linalg.norm(points - point, axis=1).min() < 1e-9)
+
+
+def test_bodies_and_points_are_drawn_where_forward_kinematics_puts_them(turning: Solution) -> None:
+    point = srm.Anchor("coupler", xyz=(1.0, 0.0, 0.6))
+    times = [0.15, 0.7]
+    options = {"kind": "poses", "at": times, "points": [point], "unit": "mm"}
+    axes = turning.plot(**options).axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (mm)", "z (mm)")
+    assert axes.get_aspect() == 1.0
+    model = turning.mechanism.model
+    data = model.createData()
+    outlines = corners(axes)
+    assert len(outlines) == 2 * 3
+    (path,) = (own for own in axes.lines if "path of" in str(own.get_label()))
+    for k, t in enumerate(times):
+        q, _ = turning(t)
+        pin.forwardKinematics(model, data, q)
+        ends = {"crank": [(1.0, 0.0, 0.0)], "rocker": [(1.5, 0.0, 0.0)]}
+        ends["coupler"] = [(2.0, 0.0, 0.0), (1.0, 0.0, 0.6)]
+        for name, local in ends.items():
+            joint = model.getJointId(name)
+            outline = outlines[3 * k + joint - 1]
+            placed = [data.oMi[joint].act(np.array(end)) for end in [(0.0, 0.0, 0.0), *local]]
+            assert len(outline) == len(placed)
+            assert all(holds(outline, 1e3 * p[[0, 2]]) for p in placed)
+        curve = np.column_stack(path.get_data())
+        assert np.linalg.norm(curve - 1e3 * placed[-1][[0, 2]], axis=1).min() < 20.0
+    # The first is paler.
+    strengths = [sum(patch.get_edgecolor()[:3]) for patch in axes.patches[1::2]]
+    assert strengths[0] > strengths[3]
+
+
+def test_poses_at_angles_of_a_crank_have_these_angles(turning: Solution) -> None:
+    axes = turning.plot(kind="poses", at=[90.0, 200.0, 330.0], crank="crank").axes[0]
+    cranks = corners(axes)[::3]
+    for angle, bar in zip((90.0, 200.0, 330.0), cranks):
+        tip = bar[np.linalg.norm(bar, axis=1).argmax()]
+        # Joints about +y turn x towards -z.
+        found = np.degrees(np.arctan2(abs(tip[1]), tip[0]))
+        assert found == pytest.approx(min(angle, 360.0 - angle), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("view", "labels"),
+    [
+        ("x", ("y (m)", "z (m)")),
+        ("z", ("x (m)", "y (m)")),
+        ((0.0, -2.0, 0.0), ("-x (m)", "z (m)")),
+        ((-1.0, 1.0, 0.0), ("along (0.71, 0.71, 0) (m)", "z (m)")),
+    ],
+)
+def test_the_direction_of_view_may_be_chosen(
+    turning: Solution, view: Any, labels: tuple[str, str]
+) -> None:
+    axes = turning.plot(kind="poses", view=view).axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == labels
+
+
+def test_the_plane_of_motion_is_found_from_the_axes_of_the_joints(ring: Solution) -> None:
+    model = pin.Model()
+    tilted = np.array([0.6, 0.0, 0.8])
+    first = add_link(model, 0, pin.JointModelRevoluteUnaligned(tilted), "first")
+    add_link(model, first, pin.JointModelRevoluteUnaligned(-tilted), "second")
+    normal = plane_normal(srm.Mechanism(model))
+    assert normal is not None
+    np.testing.assert_allclose(np.abs(normal), tilted, atol=1e-12)
+    slide = pin.JointModelPrismaticUnaligned(np.array([0.8, 0.0, -0.6]))
+    add_link(model, first, slide, "across")
+    assert plane_normal(srm.Mechanism(model)) is not None
+    add_link(model, first, pin.JointModelPX(), "out")
+    assert plane_normal(srm.Mechanism(model)) is None
+    assert plane_normal(ring.mechanism) is None
+
+
 # -- DAEs -------------------------------------------------------------------------------------
 
 
 def test_the_run_of_a_dae_has_drift_sigma_and_steps(dae: srm.DaeSolution) -> None:
     figure = dae.plot()
     drift, sigma, steps = figure.axes
-    assert figure.get_suptitle() == "index-2 DAE, PSRM, auto, rtol = 1e-06"
+    assert figure.get_suptitle() == "index-2 DAE"
     assert steps.get_xlabel() == "time"
     g = [abs(problem_two().g(t, x)) for t, x in zip(dae.t, dae.x)]
     np.testing.assert_allclose(drawn(drift)[1], np.maximum(g, 1e-17))
@@ -707,6 +865,8 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("--kind", "reactions", "--loop", "pin", "--rows"),
         ("--kind", "path", "--point", "rod:1,0,0"),
         ("--kind", "phase", "--joint", "rod"),
+        ("--kind", "poses", "--at", "0,0.2", "--point", "rod:1,0,0", "--view", "0,1,0"),
+        ("--kind", "poses", "--at", "0", "--unit", "mm", "--size", "column", "--dpi", "250"),
         ("--kind", "point", "--point", "rod:1,0,0", "--title", "A point", "--size", "8,6"),
         ("--kind", "state", "--x", "crank", "--unit", "deg", "--accelerations"),
         ("--kind", "reactions", "--joint", "crank", "--joint", "rod"),
@@ -734,6 +894,9 @@ def test_the_command_plot_draws_other_kinds_beside_the_run(
         (("--kind", "state", "--x", "C"), "--x"),
         (("--kind", "state", "--x", "crank", "--unit", "m"), "--unit"),
         (("--size", "7"), "--size"),
+        (("--dpi", "1"), "--dpi"),
+        (("--kind", "poses", "--at", "-1"), "--at"),
+        (("--kind", "poses", "--view", "1,2"), "--view"),
     ],
 )
 def test_the_command_plot_names_its_own_options(

@@ -20,7 +20,7 @@ from srm_mbs.errors import CHECK_WRITING, InputError, get_logger
 from srm_mbs.formats.files import write_bytes
 from srm_mbs.integration.singular_passages import Crossing
 from srm_mbs.simulation.result import SimulationResult
-from srm_mbs.visualization.animation.meshcat_scene import import_meshcat
+from srm_mbs.visualization.animation.meshcat_scene import BACKGROUNDS, import_meshcat
 from srm_mbs.visualization.animation.scene import ASPECT, Picture
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
@@ -33,6 +33,9 @@ MAX_SAMPLES = 3000
 NAMED_LOOPS, NAMED_PASSAGES = 12, 100
 """Numbers of loops and of passages up to which the passages name their loops."""
 DRIFT, ENERGY = "drift |g|", "energy change"
+FLOAT32_ARRAY = 0x17
+"""Type of an array of single precision in the MessagePack of msgpack-lite, with which meshcat
+reads."""
 DIGITS = 4
 """Significant digits of a value in the page, which shows three."""
 
@@ -52,7 +55,8 @@ def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -
     Returns
     -------
     dict
-        Those of :func:`values_over_time`, and ``start`` (s), ``panel``, ``notes``, ``aspect``.
+        Those of :func:`values_over_time`, and ``start`` (s), ``panel``, ``notes``, ``aspect``,
+        ``background``.
     """
     times = picture.motion.times
     data: dict[str, Any] = {"times": [], "values": [], "passages": []}
@@ -63,6 +67,7 @@ def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -
         "panel": panel,
         "notes": picture.overlays.notes,
         "aspect": ASPECT,
+        "background": BACKGROUNDS,
     }
 
 
@@ -185,11 +190,34 @@ def _packed(commands: Sequence[dict[str, Any]]) -> list[str]:
 
     packed = []
     for command in commands:
-        # Animations are played in single precision anyway, and are most of the file.
-        precision = "single" if command["type"] == "set_animation" else "double"
-        content = umsgpack.packb(command, force_float_precision=precision)
-        packed.append(base64.b64encode(content).decode("ascii"))
+        if command["type"] == "set_animation":
+            command = command | {"animations": [_compact(clip) for clip in command["animations"]]}
+        packed.append(base64.b64encode(umsgpack.packb(command)).decode("ascii"))
     return packed
+
+
+def _compact(animation: dict[str, Any]) -> dict[str, Any]:
+    """One animated node of meshcat's command, with the times and values of each track as one array.
+
+    Animations are most of the file.  three.js reads arrays of single precision, in which it plays
+    them, as well as the objects of one key each that meshcat writes, and these take twice as much.
+    """
+    import umsgpack
+
+    def array(values: Any) -> Any:
+        return umsgpack.Ext(FLOAT32_ARRAY, np.asarray(values, dtype="<f4").tobytes())
+
+    tracks = []
+    for track in animation["clip"]["tracks"]:
+        keys = track["keys"]
+        # three.js keeps what is no number as it is.
+        values = [key["value"] for key in keys]
+        arrays = {
+            "times": array([key["time"] for key in keys]),
+            "values": values if track["type"] == "bool" else array(values),
+        }
+        tracks.append({name: x for name, x in track.items() if name != "keys"} | arrays)
+    return animation | {"clip": animation["clip"] | {"tracks": tracks}}
 
 
 def write_file(path: Path, content: bytes) -> None:

@@ -223,6 +223,39 @@ def test_the_controls_are_reached_by_tab_and_have_names_to_be_read_aloud(page: A
 
 
 @pytest.mark.browser
+def test_the_controls_of_meshcat_are_hidden_until_the_key_or_the_button_shows_them(
+    page: Any,
+) -> None:
+    controls, button = page.locator(".dg.main"), page.locator("#controls")
+    assert not controls.is_visible()
+    page.locator("#toggle").focus()
+    for press in (lambda: page.keyboard.press("g"), button.click):
+        press()
+        assert controls.is_visible()
+        assert button.get_attribute("aria-pressed") == "true"
+        assert page.get_by_text("Animations", exact=True).is_visible()
+        press()
+        assert not controls.is_visible()
+        assert button.get_attribute("aria-pressed") == "false"
+
+
+@pytest.mark.browser
+def test_the_page_is_dark_where_the_browser_prefers_it_and_light_again(page: Any) -> None:
+    def colours() -> list[float]:
+        top = page.evaluate("viewer.scene_tree.find(['Background']).object.top_color[0] / 255")
+        css = "getComputedStyle(document.querySelector('#bar')).backgroundColor.match(/\\d+/)[0]"
+        return [top, int(page.evaluate(css)) / 255.0]
+
+    assert min(colours()) > 0.9
+    page.emulate_media(color_scheme="dark")
+    page.wait_for_function("viewer.scene_tree.find(['Background']).object.top_color[0] < 128")
+    assert max(colours()) < 0.5
+    page.emulate_media(color_scheme="light")
+    page.wait_for_function("viewer.scene_tree.find(['Background']).object.top_color[0] > 230")
+    assert min(colours()) > 0.9
+
+
+@pytest.mark.browser
 @pytest.mark.parametrize("size", [(1280, 720), (400, 760)])
 def test_nothing_covers_the_picture_or_leaves_the_window(page: Any, size: tuple[int, int]) -> None:
     before = page.viewport_size
@@ -549,6 +582,17 @@ def test_the_picture_goes_along_with_a_mechanism_that_travels_far(flight: srm.So
     assert picture.view.distance < 20.0
     (note,) = picture.overlays.notes
     assert re.fullmatch(r"the picture goes along with .* which travels \d+ m", note["text"])
+
+
+def test_a_free_mechanism_that_travels_about_its_own_size_is_followed_from_the_start() -> None:
+    ring = floating_ring()
+    v = np.array(ring.v0)
+    v[:3] += [4.0, 0.0, 0.0]
+    slow = srm.simulate(ring, 1.0, v0=v)
+    picture = make_picture(slow, 30.0, OverlayOptions())
+    assert picture.along is not None
+    np.testing.assert_allclose(picture.along[0], 0.0, atol=1e-12)
+    assert 2.0 < np.linalg.norm(picture.along[-1]) < 6.0
 
 
 @pytest.mark.parametrize("t", [0.05, 2.0])

@@ -102,7 +102,24 @@ function fixed(time, digits) {
   return time.toFixed(digits).replace("-", "\u2212");
 }
 
-// Bar: meshcat's own controls remain under "Open Controls".
+// The controls of meshcat itself, hidden until somebody asks for them.
+function toggle_controls() {
+  const shown = element("view").classList.toggle("meshcat-controls");
+  element("controls").setAttribute("aria-pressed", shown);
+  if (shown) viewer.gui.open();
+}
+element("controls").onclick = toggle_controls;
+
+// In the dark the background is darker too: still lighter than black pins.
+const dark = matchMedia("(prefers-color-scheme: dark)");
+function set_background() {
+  const [top, bottom] = about.background[+dark.matches];
+  viewer.set_property(["Background"], "top_color", top);
+  viewer.set_property(["Background"], "bottom_color", bottom);
+}
+dark.onchange = set_background;
+
+// Bar.
 for (const speed of SPEEDS) {
   const textContent = `${speed}\u00d7`;
   add(element("speed"), "option", { value: speed, textContent, selected: speed === 1 });
@@ -135,7 +152,11 @@ const SEEKS = {
 };
 document.addEventListener("keydown", (event) => {
   const own = event.target.closest("button, select, input, .dg");
-  if (animator.duration === 0 || event.ctrlKey || event.altKey || event.metaKey) return;
+  if (event.ctrlKey || event.altKey || event.metaKey) return;
+  if (event.key.toLowerCase() === "g" && !event.target.closest("select, .dg")) {
+    return toggle_controls();
+  }
+  if (animator.duration === 0) return;
   if (own && own !== slider && (own.tagName !== "BUTTON" || event.key === " ")) return;
   if (event.key === " ") toggle();
   else if (event.key in SEEKS) {
@@ -150,6 +171,7 @@ function lay_out() {
   laid_out = animator.actions;
   element("bar").hidden = animator.duration === 0;
   slider.max = animator.duration;
+  set_background();
   element("marks").replaceChildren(...about.passages.map(({ time, text }) => {
     const mark = document.createElement("button");
     mark.style.left = `${100 * (time - about.start) / animator.duration}%`;

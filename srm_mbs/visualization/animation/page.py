@@ -27,7 +27,12 @@ from srm_mbs.visualization.animation.meshcat_scene import (
     import_meshcat,
     node_names,
 )
-from srm_mbs.visualization.animation.scene import ASPECT, Picture
+from srm_mbs.visualization.animation.scene import (
+    ASPECT,
+    FIELD_OF_VIEW,
+    Picture,
+    points_in_view,
+)
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
 from srm_mbs.visualization.joint_components import components
 
@@ -41,8 +46,10 @@ MAX_JOINT_NUMBERS = 24_000
 """Positions and rates of all joints together: some 200 kB in a page."""
 FEWEST_JOINT_SAMPLES = 50
 """Times of the positions and rates of mechanisms of very many joints."""
-SCRIPTS = ("page.js", "bodies.js", "curves.js", "passages.js")
+SCRIPTS = ("page.js", "bodies.js", "curves.js", "passages.js", "ground.js")
 """Files of :data:`FOLDER` that are the script of the page, in this order."""
+GROUND_GAP = 2e-3
+"""Distance of the ground from the lowest point of the motion, over the height of the picture."""
 NAMED_LOOPS, NAMED_PASSAGES = 12, 100
 """Numbers of loops and of passages up to which the passages name their loops."""
 DRIFT, ENERGY = "drift |g|", "energy change"
@@ -69,7 +76,7 @@ def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -
     -------
     dict
         Those of :func:`values_over_time`, and ``start`` (s), ``panel``, ``notes``, ``bodies``
-        with the name of each node that has shapes, ``aspect``, ``background``.
+        with the name of each node that has shapes, ``ground``, ``aspect``, ``background``.
     """
     times = picture.motion.times
     data: dict[str, Any] = {"times": [], "joint_times": [], "values": [], "passages": []}
@@ -80,9 +87,28 @@ def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -
         "panel": panel,
         "notes": picture.overlays.notes,
         "bodies": _bodies(picture) if panel else [],
+        "ground": _ground(picture) if panel else None,
         "aspect": ASPECT,
         "background": BACKGROUNDS,
     }
+
+
+def _ground(picture: Picture) -> dict[str, Any] | None:
+    """The plane below the motion, perpendicular to gravity; None without gravity.
+
+    ``up`` is its normal, ``height`` (m) its coordinate along ``up``, and ``size`` (m) that of the
+    picture.
+    """
+    gravity = np.array(picture.mechanism.model.gravity.linear)
+    size = float(np.linalg.norm(gravity))
+    points = points_in_view(picture.visuals, picture.motion)
+    if not size or not len(points):
+        return None
+    up = -gravity / size
+    width = 2.0 * picture.view.distance * math.tan(math.radians(0.5 * FIELD_OF_VIEW))
+    # Not within the shapes that lie on it.
+    height = float((points @ up).min()) - GROUND_GAP * width
+    return {"up": up.tolist(), "height": height, "size": width}
 
 
 def _bodies(picture: Picture) -> list[dict[str, str]]:

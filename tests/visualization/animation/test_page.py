@@ -26,7 +26,7 @@ from srm_mbs.visualization.animation.overlays import (
     ramp_colours,
     turns_along,
 )
-from srm_mbs.visualization.animation.page import SCRIPTS, make_page, values_over_time
+from srm_mbs.visualization.animation.page import SCRIPTS, make_page, page_data, values_over_time
 from srm_mbs.visualization.animation.scene import ASPECT, FIELD_OF_VIEW, FILLED_PART, make_picture
 from srm_mbs.visualization.animation.snapshot import draw_snapshot
 from tests.support.browsing import exported, opened, placements
@@ -356,6 +356,111 @@ def test_the_picture_says_when_a_singular_configuration_is_passed(
     page.wait_for_selector("#flash", state="visible")
     page.wait_for_function("t => animator.time > t + 0.5", arg=time)
     page.wait_for_selector("#flash", state="hidden")
+
+
+LOWEST = """times => Math.min(...times.map(t => {
+  seek(t);
+  viewer.scene.updateMatrixWorld(true);
+  const up = ground.userData.up, world = body_root().object.matrixWorld.clone().invert();
+  let lowest = Infinity;
+  for (const node of Object.values(body_root().children)) node.object.traverse(mesh => {
+    if (!mesh.isMesh) return;
+    mesh.geometry.computeBoundingBox();
+    const {min, max} = mesh.geometry.boundingBox;
+    for (const x of [min.x, max.x]) for (const y of [min.y, max.y]) for (const z of [min.z, max.z])
+      lowest = Math.min(lowest, new MeshCat.THREE.Vector3(x, y, z)
+        .applyMatrix4(mesh.matrixWorld).applyMatrix4(world).dot(up));
+  });
+  return lowest;
+}))"""
+"""The lowest point of the bodies at some times (m), against gravity."""
+
+
+@pytest.mark.browser
+def test_the_ground_lies_below_the_motion_across_gravity_and_has_shadows(
+    page: Any, slider_crank: srm.Solution
+) -> None:
+    gravity = slider_crank.mechanism.model.gravity.linear
+    up = np.array(page.evaluate("ground.userData.up.toArray()"))
+    np.testing.assert_allclose(up, -gravity / np.linalg.norm(gravity), atol=1e-12)
+    lowest = page.evaluate(LOWEST, np.linspace(0.0, 8.0, 41).tolist())
+    height, size = page.evaluate("[about.ground.height, about.ground.size]")
+    assert 0.0 < lowest - height < 0.02 * size
+
+    def picture() -> Any:
+        page.evaluate("viewer.render()")
+        image = Image.open(io.BytesIO(page.locator("#meshcat-pane").screenshot()))
+        return np.asarray(image.convert("L"), dtype=float)
+
+    page.evaluate(READ, 2.5)
+    lit = "on => { ground.children.find(c => c.isLight).castShadow = on; viewer.set_dirty(); }"
+    shaded = picture()
+    page.evaluate(lit, False)
+    plain = picture()
+    page.evaluate(lit, True)
+    assert (plain - shaded).max() > 10.0
+    assert (shaded - plain).max() < 10.0  # nothing is brighter
+
+
+@pytest.mark.browser
+def test_the_bar_is_as_long_as_it_says_and_the_axes_are_those_of_the_world(page: Any) -> None:
+    page.wait_for_function("element('length').textContent !== ''")
+
+    def bar() -> tuple[float, float]:
+        number, unit = page.locator("#length").inner_text().split()
+        metres = float(number) * {"m": 1.0, "mm": 1e-3}[unit]
+        return metres, page.locator("#length").bounding_box()["width"]
+
+    length, pixels = bar()
+    # Two points beside the target of the camera, across the direction of view.
+    seen = page.evaluate(
+        """length => {
+          const camera = viewer.camera, at = viewer.controls.target.clone()
+            .applyMatrix4(camera.parent.matrixWorld).applyMatrix4(camera.matrixWorldInverse);
+          const x = [0, length].map(d => new MeshCat.THREE.Vector3(at.x + d, at.y, at.z)
+            .applyMatrix4(camera.projectionMatrix).x);
+          return 0.5 * (x[1] - x[0]) * pane.clientWidth;
+        }""",
+        length,
+    )
+    assert pixels == pytest.approx(seen, rel=0.01)
+    assert f"{length:.0e}"[0] in "125"
+    page.evaluate("viewer.camera.position.multiplyScalar(0.125); viewer.set_dirty()")
+    page.wait_for_function("text => element('length').textContent !== text", arg=f"{length:g} m")
+    assert bar()[0] < 0.3 * length
+    page.evaluate("viewer.camera.position.multiplyScalar(8); viewer.set_dirty()")
+    ends = page.evaluate(
+        "['x', 'y', 'z'].map(n => [element(`axis-${n}`).x2.baseVal.value - 28,"
+        " 28 - element(`axis-${n}`).y2.baseVal.value])"
+    )
+    view = make_picture(srm.simulate(load("slider_crank"), 0.1), 20.0, OverlayOptions()).view
+    np.testing.assert_allclose(np.array(ends), 18.0 * view.axes[:2].T, atol=0.1)
+
+
+def test_without_gravity_there_is_no_ground() -> None:
+    floating = srm.simulate(floating_ring(), 0.1)
+    data = page_data(floating, make_picture(floating, 20.0, OverlayOptions()))
+    assert data["ground"] is None
+    assert (
+        page_data(floating, make_picture(floating, 20.0, OverlayOptions()), panel=False)["bodies"]
+        == []
+    )
+
+
+@pytest.mark.browser
+def test_the_page_of_a_walker_is_drawn_in_few_calls_of_few_triangles(
+    browser: Any, tmp_path: Path
+) -> None:
+    with exported(browser, tmp_path, srm.simulate(load("jansen_walker"), 0.2)) as page:
+        calls, triangles = page.evaluate("""() => {
+          const info = viewer.renderer.info;
+          info.autoReset = false;
+          info.reset();
+          viewer.render();  // with the pass of the shadows
+          return [info.render.calls, info.render.triangles];
+        }""")
+    assert 100 < calls < 300
+    assert 1e4 < triangles < 2e5
 
 
 @pytest.mark.browser

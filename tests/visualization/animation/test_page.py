@@ -388,10 +388,11 @@ def test_the_ground_lies_below_the_motion_across_gravity_and_has_shadows(
     assert 0.0 < lowest - height < 0.02 * size
 
     def picture() -> Any:
-        page.evaluate("viewer.render()")
+        page.evaluate(READ, 2.5)
         image = Image.open(io.BytesIO(page.locator("#meshcat-pane").screenshot()))
         return np.asarray(image.convert("L"), dtype=float)
 
+    page.mouse.move(5.0, 390.0)  # on no body, which would be brighter
     page.evaluate(READ, 2.5)
     lit = "on => { ground.children.find(c => c.isLight).castShadow = on; viewer.set_dirty(); }"
     shaded = picture()

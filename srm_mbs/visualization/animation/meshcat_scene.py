@@ -23,7 +23,11 @@ from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, Picture
 from srm_mbs.visualization.animation.shapes import Box, Colour, Cylinder, Mesh, Shape, Sphere
 from srm_mbs.visualization.animation.trajectory import ActiveIntervals
 
-TOP_COLOUR, BOTTOM_COLOUR = (1.0, 1.0, 1.0), (0.90, 0.92, 0.94)
+BACKGROUNDS = (
+    ((1.0, 1.0, 1.0), (0.90, 0.92, 0.94)),
+    ((0.42, 0.45, 0.49), (0.27, 0.30, 0.33)),
+)
+"""Colours at the top and bottom of the picture, where the browser prefers light and dark pages."""
 LAMPS = {
     "PointLightNegativeX": ((-0.6, 0.9, -1.0), 0.55),
     "PointLightPositiveX": ((1.0, 0.3, -0.5), 0.25),
@@ -104,8 +108,8 @@ class _Drawing:
     def light_scene(self) -> None:
         """Background, lights and camera."""
         scene, view = self.scene, self.picture.view
-        scene["/Background"].set_property("top_color", list(TOP_COLOUR))
-        scene["/Background"].set_property("bottom_color", list(BOTTOM_COLOUR))
+        scene["/Background"].set_property("top_color", list(BACKGROUNDS[0][0]))
+        scene["/Background"].set_property("bottom_color", list(BACKGROUNDS[0][1]))
         scene["/Axes"].set_property("visible", False)
         scene["/Grid"].set_property("visible", False)
         for name, (position, intensity) in LAMPS.items():

@@ -13,16 +13,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import row_dimensions
 from srm_mbs.errors import CHECK_WRITING, InputError, get_logger
 from srm_mbs.formats.files import write_bytes
 from srm_mbs.integration.singular_passages import Crossing
 from srm_mbs.simulation.result import SimulationResult
-from srm_mbs.visualization.animation.meshcat_scene import import_meshcat
-from srm_mbs.visualization.animation.scene import ASPECT, Picture
+from srm_mbs.visualization.animation.meshcat_scene import (
+    BACKGROUNDS,
+    import_meshcat,
+    node_names,
+)
+from srm_mbs.visualization.animation.scene import (
+    ASPECT,
+    FIELD_OF_VIEW,
+    Picture,
+    points_in_view,
+)
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
+from srm_mbs.visualization.joint_components import components
 
 log = get_logger(__name__)
 
@@ -30,9 +42,20 @@ FOLDER = Path(__file__).with_name("web")
 
 MAX_SAMPLES = 3000
 """Times at which the values are sampled: some 100 kB in a page."""
+MAX_JOINT_NUMBERS = 24_000
+"""Positions and rates of all joints together: some 200 kB in a page."""
+FEWEST_JOINT_SAMPLES = 50
+"""Times of the positions and rates of mechanisms of very many joints."""
+SCRIPTS = ("page.js", "bodies.js", "curves.js", "passages.js", "ground.js")
+"""Files of :data:`FOLDER` that are the script of the page, in this order."""
+GROUND_GAP = 2e-3
+"""Distance of the ground from the lowest point of the motion, over the height of the picture."""
 NAMED_LOOPS, NAMED_PASSAGES = 12, 100
 """Numbers of loops and of passages up to which the passages name their loops."""
 DRIFT, ENERGY = "drift |g|", "energy change"
+FLOAT32_ARRAY = 0x17
+"""Type of an array of single precision in the MessagePack of msgpack-lite, with which meshcat
+reads."""
 DIGITS = 4
 """Significant digits of a value in the page, which shows three."""
 
@@ -52,28 +75,67 @@ def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -
     Returns
     -------
     dict
-        Those of :func:`values_over_time`, and ``start`` (s), ``panel``, ``notes``, ``aspect``.
+        Those of :func:`values_over_time`, and ``start`` (s), ``panel``, ``notes``, ``bodies``
+        with the name of each node that has shapes, ``ground``, ``aspect``, ``background``.
     """
     times = picture.motion.times
-    data: dict[str, Any] = {"times": [], "values": [], "passages": []}
+    data: dict[str, Any] = {"times": [], "joint_times": [], "values": [], "passages": []}
     if panel and isinstance(motion, SimulationResult):
         data = values_over_time(motion, times)
     return data | {
         "start": float(times[0]),
         "panel": panel,
         "notes": picture.overlays.notes,
+        "bodies": _bodies(picture) if panel else [],
+        "ground": _ground(picture) if panel else None,
         "aspect": ASPECT,
+        "background": BACKGROUNDS,
     }
 
 
+def _ground(picture: Picture) -> dict[str, Any] | None:
+    """The plane below the motion, perpendicular to gravity; None without gravity.
+
+    ``up`` is its normal, ``height`` (m) its coordinate along ``up``, and ``size`` (m) that of the
+    picture.
+    """
+    gravity = np.array(picture.mechanism.model.gravity.linear)
+    size = float(np.linalg.norm(gravity))
+    points = points_in_view(picture.visuals, picture.motion)
+    if not size or not len(points):
+        return None
+    up = -gravity / size
+    width = 2.0 * picture.view.distance * math.tan(math.radians(0.5 * FIELD_OF_VIEW))
+    # Not within the shapes that lie on it.
+    height = float((points @ up).min()) - GROUND_GAP * width
+    return {"up": up.tolist(), "height": height, "size": width}
+
+
+def _bodies(picture: Picture) -> list[dict[str, str]]:
+    """The nodes of the page that have shapes, with the names of their links."""
+    model = picture.mechanism.model
+    links: dict[int, list[str]] = {}
+    for frame in model.frames:
+        if frame.type == pin.FrameType.BODY:
+            links.setdefault(int(frame.parentJoint), []).append(frame.name)
+    nodes = node_names(picture.mechanism)
+    joints = sorted({visual.joint for visual in picture.visuals})
+    # A model without links has joints only.
+    named = {joint: ", ".join(links.get(joint, [nodes[joint]])) for joint in joints}
+    return [{"node": nodes[joint], "name": name} for joint, name in named.items()]
+
+
 def values_over_time(solution: SimulationResult, times: FloatArray) -> dict[str, Any]:
-    """Drift, energy and sigma of a run at the ``times`` (n,) s of its key frames.
+    """Drift, energy and sigma of a run at the ``times`` (n,) s of its key frames, and the positions
+    and rates of its joints.
 
     Returns
     -------
     dict
-        ``times`` (s) and ``values``, each with ``label``, ``unit`` and ``samples`` at the times,
-        null where they are not finite; ``passages``, each with ``time`` (s) and ``text``.
+        ``times`` and ``joint_times`` (s), and ``values``, each with ``label``, ``unit`` and
+        ``samples``, null where they are not finite.  Values of a joint have ``body``, the node of
+        the body that it moves, and are sampled at ``joint_times``, the others at ``times``.
+        ``passages``, each with ``time`` (s) and ``text``.
     """
     crossings = solution.crossings
     few = len(solution.mechanism.loops) <= NAMED_LOOPS and len(crossings) <= NAMED_PASSAGES
@@ -88,9 +150,9 @@ def values_over_time(solution: SimulationResult, times: FloatArray) -> dict[str,
     unit = drift_unit(solution)
     values = []
 
-    def add(label: str, unit: str, samples: FloatArray) -> None:
+    def add(label: str, unit: str, samples: FloatArray, **more: str) -> None:
         rounded = [float(f"{x:.{DIGITS}g}") if math.isfinite(x) else None for x in samples.tolist()]
-        values.append({"label": label, "unit": unit, "samples": rounded})
+        values.append({"label": label, "unit": unit, "samples": rounded} | more)
 
     with np.errstate(over="ignore", invalid="ignore"):
         if unit:
@@ -98,8 +160,29 @@ def values_over_time(solution: SimulationResult, times: FloatArray) -> dict[str,
         add(ENERGY, "J", run.energy - solution.at(times[:1]).energy)
         if unit and solution.steps.count:
             add("sigma", "", sigma_at(solution, times))
-    seconds = [float(f"{t:.9g}") for t in times.tolist()]
-    return {"times": seconds, "values": values, "passages": passages}
+        joint_times = _joint_times(solution.mechanism, times)
+        run = run if joint_times is times else solution.at(joint_times)
+        for joint, node in zip(solution.mechanism.joint_names, node_names(solution.mechanism)[1:]):
+            for part in components(run, joint):
+                for k, axis in enumerate(part.names):
+                    label = " ".join(word for word in (joint, part.part, axis) if word)
+                    add(label, part.unit, part.positions[:, k], body=node)
+                    add(f"{label} rate", f"{part.unit}/s", part.rates[:, k], body=node)
+    seconds, joint_seconds = (
+        [float(f"{t:.9g}") for t in some.tolist()] for some in (times, joint_times)
+    )
+    return {
+        "times": seconds,
+        "joint_times": joint_seconds,
+        "values": values,
+        "passages": passages,
+    }
+
+
+def _joint_times(mechanism: Mechanism, times: FloatArray) -> FloatArray:
+    """Times (s) of the values of joints: ``times``, or fewer if there are many joints."""
+    allowed = max(MAX_JOINT_NUMBERS // max(2 * mechanism.model.nv, 1), FEWEST_JOINT_SAMPLES)
+    return times if len(times) <= allowed else np.linspace(times[0], times[-1], allowed)
 
 
 def drift_unit(motion: DrawableMotion) -> str:
@@ -156,7 +239,7 @@ def make_page(title: str, data: dict[str, Any], commands: Sequence[dict[str, Any
         viewer=(root / "main.min.js").read_text(encoding="utf-8"),
         commands=None if commands is None else _packed(commands),
         data=data,
-        script=(FOLDER / "page.js").read_text(encoding="utf-8"),
+        script="".join((FOLDER / name).read_text(encoding="utf-8") for name in SCRIPTS),
     )
 
 
@@ -185,11 +268,34 @@ def _packed(commands: Sequence[dict[str, Any]]) -> list[str]:
 
     packed = []
     for command in commands:
-        # Animations are played in single precision anyway, and are most of the file.
-        precision = "single" if command["type"] == "set_animation" else "double"
-        content = umsgpack.packb(command, force_float_precision=precision)
-        packed.append(base64.b64encode(content).decode("ascii"))
+        if command["type"] == "set_animation":
+            command = command | {"animations": [_compact(clip) for clip in command["animations"]]}
+        packed.append(base64.b64encode(umsgpack.packb(command)).decode("ascii"))
     return packed
+
+
+def _compact(animation: dict[str, Any]) -> dict[str, Any]:
+    """One animated node of meshcat's command, with the times and values of each track as one array.
+
+    Animations are most of the file.  three.js reads arrays of single precision, in which it plays
+    them, as well as the objects of one key each that meshcat writes, and these take twice as much.
+    """
+    import umsgpack
+
+    def array(values: Any) -> Any:
+        return umsgpack.Ext(FLOAT32_ARRAY, np.asarray(values, dtype="<f4").tobytes())
+
+    tracks = []
+    for track in animation["clip"]["tracks"]:
+        keys = track["keys"]
+        # three.js keeps what is no number as it is.
+        values = [key["value"] for key in keys]
+        arrays = {
+            "times": array([key["time"] for key in keys]),
+            "values": values if track["type"] == "bool" else array(values),
+        }
+        tracks.append({name: x for name, x in track.items() if name != "keys"} | arrays)
+    return animation | {"clip": animation["clip"] | {"tracks": tracks}}
 
 
 def write_file(path: Path, content: bytes) -> None:

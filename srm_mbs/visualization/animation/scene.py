@@ -39,7 +39,7 @@ SMALLEST_DISTANCE = 1e-9
 CAMERA_FRAMES = 300
 """Key frames from which the place of the camera is computed."""
 FREE_JOINTS = ("JointModelFreeFlyer", "JointModelPlanar")
-FOLLOW_RATIO = 5.0
+FOLLOW_RATIO = 1.5
 """The camera follows a mechanism that is free in space if a fixed camera would show it smaller by
 more than this factor."""
 

@@ -52,6 +52,12 @@ TEMPORARY_PREFIX = "srm-mbs-"
 """Of the names of temporary folders, which have the page and the profile of the browser."""
 LOCKING_TIME = 60.0
 """Age (s) of a temporary folder above which its program has locked it, unless it was killed."""
+_SMOOTH = """() => {
+  viewer.renderer.setPixelRatio(2);
+  viewer.set_3d_pane_size();
+}"""
+"""Twice as many pixels in each direction, which the browser averages: software rendering does not
+smooth the edges enough by itself."""
 _SEEK = """async t => {
   viewer.animator.pause();
   viewer.animator.seek(t);
@@ -59,7 +65,7 @@ _SEEK = """async t => {
   const frame = () => new Promise(resolve => requestAnimationFrame(resolve));
   await frame(); await frame();
 }"""
-BARE = "#bar, .dg { display: none !important; }"
+BARE = "#bar, #corner, .dg { display: none !important; }"
 """Style of the page in images: no controls."""
 
 
@@ -229,6 +235,7 @@ def photographer(
         page.goto(file.as_uri())
         page.wait_for_function("viewer.scene_tree.children.mechanism !== undefined")
         page.add_style_tag(content=style)
+        page.evaluate(_SMOOTH)
         start = solution.span[0]
 
         def photograph(t: float) -> bytes:

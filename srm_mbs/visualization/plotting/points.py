@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from srm_mbs.dynamics.scaling import coordinate_units
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.visualization.joint_components import XYZ
 from srm_mbs.visualization.plotting.figure import (
     PER_TIME,
     WIDTH,
@@ -25,7 +26,7 @@ from srm_mbs.visualization.plotting.figure import (
     title_columns,
     wrapped,
 )
-from srm_mbs.visualization.plotting.joints import LABEL_WIDTH, XYZ, noise
+from srm_mbs.visualization.plotting.joints import LABEL_WIDTH, noise
 from srm_mbs.visualization.plotting.path import moving_points, some_places
 from srm_mbs.visualization.plotting.sampling import read_forces, read_smoothly
 

@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from srm_mbs.visualization.animation.overlays import (
     ramp_colours,
     turns_along,
 )
-from srm_mbs.visualization.animation.page import make_page, values_over_time
+from srm_mbs.visualization.animation.page import SCRIPTS, make_page, page_data, values_over_time
 from srm_mbs.visualization.animation.scene import ASPECT, FIELD_OF_VIEW, FILLED_PART, make_picture
 from srm_mbs.visualization.animation.snapshot import draw_snapshot
 from tests.support.browsing import exported, opened, placements
@@ -220,6 +221,280 @@ def test_the_controls_are_reached_by_tab_and_have_names_to_be_read_aloud(page: A
         reached.append(page.evaluate("document.activeElement.id"))
         page.keyboard.press("Tab")
     assert reached == ["toggle", "speed", "loop", "time"]
+
+
+POINT_OF = """([node, at]) => {
+  viewer.render();
+  viewer.scene.updateMatrixWorld(true);
+  const place = new MeshCat.THREE.Vector3(...at).applyMatrix4(
+    viewer.scene_tree.find(["mechanism", node]).object.matrixWorld).project(viewer.camera);
+  const box = pane.getBoundingClientRect();
+  return [box.left + 0.5 * (1 + place.x) * box.width, box.top + 0.5 * (1 - place.y) * box.height];
+}"""
+"""Where a point of a body is seen in the window (pixels)."""
+
+
+@pytest.mark.browser
+def test_the_pointer_names_a_body_and_a_click_or_touch_shows_the_values_of_its_joint(
+    page: Any, slider_crank: srm.Solution
+) -> None:
+    page.evaluate("seek(2.5)")
+    x, y = page.evaluate(POINT_OF, ["rod", [1.0, 0.0, 0.0]])
+    tip = page.locator("#tip")
+    page.mouse.move(x, y)
+    assert tip.is_visible()
+    assert tip.inner_text() == "rod"
+    page.mouse.move(5.0, 390.0)  # the bar
+    assert not tip.is_visible()
+    page.mouse.click(x, y)
+    q, v = slider_crank.at([2.5]).joint("rod")
+    found = {name: text for name, text, _ in page.evaluate(READ, 2.5)}
+    assert float(found["rod rate"].replace("\u2212", "-")) == pytest.approx(v[0], rel=6e-3)
+    # The name of the body stands above its values.
+    rows = page.evaluate(READ, 2.5)
+    assert [row[0] for row in rows][-3:] == ["rod", "rod", "rod rate"]
+    assert float(rows[-2][1].replace("\u2212", "-")) == pytest.approx(q[0], rel=6e-3)
+    assert [row[2] for row in rows][-3:] == ["", "rad", "rad/s"]
+    opacity = """n => Object.values(body_root().children[n].children)[0]
+        .children["<object>"].object.material.opacity"""
+    assert page.evaluate(opacity, "crank") < 0.5
+    assert page.evaluate(opacity, "rod") == 1.0
+    # Turning the picture is no click.
+    page.mouse.move(30.0, 250.0)
+    page.mouse.down()
+    page.mouse.move(60.0, 250.0)
+    page.mouse.up()
+    assert page.locator("#body").input_value() == "rod"
+    page.mouse.move(60.0, 250.0)
+    page.mouse.down()
+    page.mouse.move(30.0, 250.0)
+    page.mouse.up()
+    page.keyboard.press("Escape")
+    assert "rod rate" not in {row[0] for row in page.evaluate(READ, 2.5)}
+    assert page.evaluate(opacity, "crank") == 1.0
+    # For keyboards and screen readers there is a list.
+    page.get_by_role("combobox", name="body").select_option("crank")
+    assert "crank rate" in {row[0] for row in page.evaluate(READ, 2.5)}
+    page.get_by_role("combobox", name="body").select_option("")
+
+
+@pytest.mark.browser
+def test_a_touch_chooses_a_body_on_a_phone(
+    browser: Any, slider_crank: srm.Solution, tmp_path: Path
+) -> None:
+    path = tmp_path / "page.html"
+    slider_crank.export_html(path, fps=20.0)
+    context = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True)
+    shown = context.new_page()
+    shown.goto(path.as_uri())
+    shown.wait_for_function("away > 1.5")
+    shown.evaluate("seek(2.5)")
+    x, y = shown.evaluate(POINT_OF, ["crank", [1.0, 0.0, 0.0]])
+    shown.touchscreen.tap(x, y)
+    shown.wait_for_function("chosen === 'crank'")
+    boxes = [shown.locator(name).bounding_box() for name in ("#panel", "#corner", "#bar")]
+    for above, below in pairwise(boxes):
+        assert above["y"] + above["height"] <= below["y"]
+    assert all(box["x"] >= 0.0 and box["x"] + box["width"] <= 390.0 for box in boxes)
+    context.close()
+
+
+@pytest.mark.browser
+def test_curves_are_in_step_with_the_motion_and_a_click_on_one_moves_the_time(page: Any) -> None:
+    page.keyboard.press("c")
+    page.wait_for_selector(".curve")
+    page.locator("#quantity").select_option("rod rate")
+    page.locator("#quantity").select_option("rod rate")  # there is one of each
+    heads = page.locator(".curve .head span:first-child")
+    assert heads.all_inner_texts() == ["sigma", "rod rate (rad/s)"]
+    plot = page.locator(".curve svg").last
+    box = plot.bounding_box()
+    page.mouse.click(box["x"] + 0.25 * box["width"], box["y"] + 20.0)
+    assert page.evaluate("[animator.playing, animator.time]") == [
+        False,
+        pytest.approx(2.0, abs=8.0 / box["width"]),
+    ]
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 20.0)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.75 * box["width"], box["y"] + 20.0)
+    page.mouse.up()
+    time = page.evaluate("animator.time")
+    assert time == pytest.approx(6.0, abs=8.0 / box["width"])
+    page.wait_for_function(
+        "t => Math.abs(curves[1].cursor.x1.baseVal.value - 125 * t) < 1", arg=time
+    )
+    # The curve is where the panel says: the height of its point there, between its ends.
+    high, low = page.evaluate("[Math.max, Math.min].map(f => f(...curves[1].value.samples))")
+    points = page.evaluate(
+        "[...document.querySelectorAll('.plot path')].at(-1).getAttribute('d').slice(1).split('L')"
+    )
+    x, y = np.array([[float(c) for c in point.split(" ")] for point in points]).T
+    here = page.evaluate("t => value_at(curves[1].value, t)", time)
+    height = high - (np.interp(125.0 * time, x, y) - 4.0) / 76.0 * (high - low)
+    assert height == pytest.approx(here, abs=0.01 * (high - low))
+    assert page.locator(".curve").last.locator(".passage").count() == 4
+    page.get_by_role("button", name="remove the curve of rod rate").click()
+    assert heads.all_inner_texts() == ["sigma"]
+    page.locator("#show-curves").click()
+    assert not page.locator("#curves").is_visible()
+
+
+@pytest.mark.browser
+def test_the_picture_says_when_a_singular_configuration_is_passed(
+    page: Any, slider_crank: srm.Solution
+) -> None:
+    flash, time = page.locator("#flash"), slider_crank.crossings[1].time
+    page.evaluate("t => seek(t)", time - 0.5)
+    page.wait_for_selector("#flash", state="hidden")
+    page.evaluate("t => seek(t)", time)
+    page.wait_for_selector("#flash", state="visible")
+    assert f"t = {time:.4g} s" in flash.inner_text()
+    # While it plays, long enough to be read, at any speed.
+    page.evaluate("t => seek(t)", time - 0.2)
+    page.wait_for_selector("#flash", state="hidden")
+    page.locator("#toggle").click()
+    page.wait_for_selector("#flash", state="visible")
+    page.wait_for_function("t => animator.time > t + 0.5", arg=time)
+    page.wait_for_selector("#flash", state="hidden")
+
+
+LOWEST = """times => Math.min(...times.map(t => {
+  seek(t);
+  viewer.scene.updateMatrixWorld(true);
+  const up = ground.userData.up, world = body_root().object.matrixWorld.clone().invert();
+  let lowest = Infinity;
+  for (const node of Object.values(body_root().children)) node.object.traverse(mesh => {
+    if (!mesh.isMesh) return;
+    mesh.geometry.computeBoundingBox();
+    const {min, max} = mesh.geometry.boundingBox;
+    for (const x of [min.x, max.x]) for (const y of [min.y, max.y]) for (const z of [min.z, max.z])
+      lowest = Math.min(lowest, new MeshCat.THREE.Vector3(x, y, z)
+        .applyMatrix4(mesh.matrixWorld).applyMatrix4(world).dot(up));
+  });
+  return lowest;
+}))"""
+"""The lowest point of the bodies at some times (m), against gravity."""
+
+
+@pytest.mark.browser
+def test_the_ground_lies_below_the_motion_across_gravity_and_has_shadows(
+    page: Any, slider_crank: srm.Solution
+) -> None:
+    gravity = slider_crank.mechanism.model.gravity.linear
+    up = np.array(page.evaluate("ground.userData.up.toArray()"))
+    np.testing.assert_allclose(up, -gravity / np.linalg.norm(gravity), atol=1e-12)
+    lowest = page.evaluate(LOWEST, np.linspace(0.0, 8.0, 41).tolist())
+    height, size = page.evaluate("[about.ground.height, about.ground.size]")
+    assert 0.0 < lowest - height < 0.02 * size
+
+    def picture() -> Any:
+        page.evaluate(READ, 2.5)
+        image = Image.open(io.BytesIO(page.locator("#meshcat-pane").screenshot()))
+        return np.asarray(image.convert("L"), dtype=float)
+
+    page.mouse.move(5.0, 390.0)  # on no body, which would be brighter
+    page.evaluate(READ, 2.5)
+    lit = "on => { ground.children.find(c => c.isLight).castShadow = on; viewer.set_dirty(); }"
+    shaded = picture()
+    page.evaluate(lit, False)
+    plain = picture()
+    page.evaluate(lit, True)
+    assert (plain - shaded).max() > 10.0
+    assert (shaded - plain).max() < 10.0  # nothing is brighter
+
+
+@pytest.mark.browser
+def test_the_bar_is_as_long_as_it_says_and_the_axes_are_those_of_the_world(page: Any) -> None:
+    page.wait_for_function("element('length').textContent !== ''")
+
+    def bar() -> tuple[float, float]:
+        number, unit = page.locator("#length").inner_text().split()
+        metres = float(number) * {"m": 1.0, "mm": 1e-3}[unit]
+        return metres, page.locator("#length").bounding_box()["width"]
+
+    length, pixels = bar()
+    # Two points beside the target of the camera, across the direction of view.
+    seen = page.evaluate(
+        """length => {
+          const camera = viewer.camera, at = viewer.controls.target.clone()
+            .applyMatrix4(camera.parent.matrixWorld).applyMatrix4(camera.matrixWorldInverse);
+          const x = [0, length].map(d => new MeshCat.THREE.Vector3(at.x + d, at.y, at.z)
+            .applyMatrix4(camera.projectionMatrix).x);
+          return 0.5 * (x[1] - x[0]) * pane.clientWidth;
+        }""",
+        length,
+    )
+    assert pixels == pytest.approx(seen, rel=0.01)
+    assert f"{length:.0e}"[0] in "125"
+    page.evaluate("viewer.camera.position.multiplyScalar(0.125); viewer.set_dirty()")
+    page.wait_for_function("text => element('length').textContent !== text", arg=f"{length:g} m")
+    assert bar()[0] < 0.3 * length
+    page.evaluate("viewer.camera.position.multiplyScalar(8); viewer.set_dirty()")
+    ends = page.evaluate(
+        "['x', 'y', 'z'].map(n => [element(`axis-${n}`).x2.baseVal.value - 28,"
+        " 28 - element(`axis-${n}`).y2.baseVal.value])"
+    )
+    view = make_picture(srm.simulate(load("slider_crank"), 0.1), 20.0, OverlayOptions()).view
+    np.testing.assert_allclose(np.array(ends), 18.0 * view.axes[:2].T, atol=0.1)
+
+
+def test_without_gravity_there_is_no_ground() -> None:
+    floating = srm.simulate(floating_ring(), 0.1)
+    data = page_data(floating, make_picture(floating, 20.0, OverlayOptions()))
+    assert data["ground"] is None
+    assert (
+        page_data(floating, make_picture(floating, 20.0, OverlayOptions()), panel=False)["bodies"]
+        == []
+    )
+
+
+@pytest.mark.browser
+def test_the_page_of_a_walker_is_drawn_in_few_calls_of_few_triangles(
+    browser: Any, tmp_path: Path
+) -> None:
+    with exported(browser, tmp_path, srm.simulate(load("jansen_walker"), 0.2)) as page:
+        calls, triangles = page.evaluate("""() => {
+          const info = viewer.renderer.info;
+          info.autoReset = false;
+          info.reset();
+          viewer.render();  // with the pass of the shadows
+          return [info.render.calls, info.render.triangles];
+        }""")
+    assert 100 < calls < 300
+    assert 1e4 < triangles < 2e5
+
+
+@pytest.mark.browser
+def test_the_controls_of_meshcat_are_hidden_until_the_key_or_the_button_shows_them(
+    page: Any,
+) -> None:
+    controls, button = page.locator(".dg.main"), page.locator("#controls")
+    assert not controls.is_visible()
+    page.locator("#toggle").focus()
+    for press in (lambda: page.keyboard.press("g"), button.click):
+        press()
+        assert controls.is_visible()
+        assert button.get_attribute("aria-pressed") == "true"
+        assert page.get_by_text("Animations", exact=True).is_visible()
+        press()
+        assert not controls.is_visible()
+        assert button.get_attribute("aria-pressed") == "false"
+
+
+@pytest.mark.browser
+def test_the_page_is_dark_where_the_browser_prefers_it_and_light_again(page: Any) -> None:
+    def colours() -> list[float]:
+        top = page.evaluate("viewer.scene_tree.find(['Background']).object.top_color[0] / 255")
+        css = "getComputedStyle(document.querySelector('#bar')).backgroundColor.match(/\\d+/)[0]"
+        return [top, int(page.evaluate(css)) / 255.0]
+
+    assert min(colours()) > 0.9
+    page.emulate_media(color_scheme="dark")
+    page.wait_for_function("viewer.scene_tree.find(['Background']).object.top_color[0] < 128")
+    assert max(colours()) < 0.5
+    page.emulate_media(color_scheme="light")
+    page.wait_for_function("viewer.scene_tree.find(['Background']).object.top_color[0] > 230")
+    assert min(colours()) > 0.9
 
 
 @pytest.mark.browser
@@ -553,6 +828,17 @@ def test_the_picture_goes_along_with_a_mechanism_that_travels_far(flight: srm.So
     assert re.fullmatch(r"the picture goes along with .* which travels \d+ m", note["text"])
 
 
+def test_a_free_mechanism_that_travels_about_its_own_size_is_followed_from_the_start() -> None:
+    ring = floating_ring()
+    v = np.array(ring.v0)
+    v[:3] += [4.0, 0.0, 0.0]
+    slow = srm.simulate(ring, 1.0, v0=v)
+    picture = make_picture(slow, 30.0, OverlayOptions())
+    assert picture.along is not None
+    np.testing.assert_allclose(picture.along[0], 0.0, atol=1e-12)
+    assert 2.0 < np.linalg.norm(picture.along[-1]) < 6.0
+
+
 @pytest.mark.parametrize("t", [0.05, 2.0])
 def test_the_snapshot_of_a_mechanism_that_travels_far_shows_it_at_any_time(
     flight: srm.Solution, t: float
@@ -620,7 +906,7 @@ def test_names_do_not_end_the_script_of_a_page() -> None:
 def test_what_the_page_is_made_of_is_package_data() -> None:
     folder = Path(srm.__file__).parent / "visualization/animation/web"
     names = {file.name for file in folder.iterdir()}
-    assert {"page.html.j2", "notebook.html.j2", "page.js"} <= names
+    assert {"page.html.j2", "notebook.html.j2", *SCRIPTS} <= names
 
 
 @pytest.mark.browser

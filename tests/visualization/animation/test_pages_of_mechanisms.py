@@ -28,7 +28,7 @@ REACH = """times => times.map(t => {
   viewer.camera.updateMatrixWorld(true);
   const reach = [0, 0, 0];
   const measure = o => {
-    if (!o.isMesh) return;
+    if (!o.isMesh || o.material.isShadowMaterial) return;  // the ground leaves the picture
     o.geometry.computeBoundingBox();
     const {min, max} = o.geometry.boundingBox;
     for (const x of [min.x, max.x]) for (const y of [min.y, max.y]) for (const z of [min.z, max.z])

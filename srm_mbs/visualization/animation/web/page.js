@@ -25,6 +25,8 @@ else for (const text of scene) {
 const element = (id) => document.getElementById(id);
 const add = (parent, tag, properties) =>
   Object.assign(parent.appendChild(document.createElement(tag)), properties);
+// What the other files of the script add: keys, and what follows a new scene or each picture.
+const KEYS = {}, at_layout = [], at_frame = [];
 const animator = viewer.animator, slider = element("time"), clock = document.querySelector("output");
 
 // The picture is made for one shape of window: step back in a narrower one.
@@ -43,20 +45,27 @@ function step_back() {
 }
 
 // Panel: time, and the values of the run there, interpolated between their samples.
-let cells = [];
-function add_row(label, unit) {
+let cells = new Map();  // of each value, and of the time as "t"
+function add_row(label, unit, value) {
   const row = document.querySelector("#panel table").insertRow();
   for (const text of [label, "", unit]) row.insertCell().textContent = text;
-  cells.push(row.cells[1]);
+  cells.set(value, row.cells[1]);
+  return row;
 }
 function fill_panel() {
-  cells = [];
+  cells = new Map();
   document.querySelector("#panel table").replaceChildren();
   const notes = element("notes");
   notes.replaceChildren();
   element("name").textContent = document.title;
-  if (about.panel) add_row("t", "s");
-  for (const value of about.values) add_row(value.label, value.unit);
+  if (about.panel) add_row("t", "s", "t");
+  for (const value of about.values) {
+    if (!value.body) add_row(value.label, value.unit, value);
+  }
+  if (chosen) add_row(name_of(chosen), "", "chosen").className = "chosen";
+  for (const value of about.values) {
+    if (chosen && value.body === chosen) add_row(value.label, value.unit, value);
+  }
   for (const note of about.notes) {
     add(notes, "div", { textContent: note.text });
     if (!note.ramp) continue;
@@ -67,10 +76,11 @@ function fill_panel() {
   }
   element("panel").hidden = !about.panel && !about.notes.length;
 }
-fill_panel();
 
-function value_at(samples, time) {
-  const times = about.times;
+const times_of = (value) => value.body ? about.joint_times : about.times;
+
+function value_at(value, time) {
+  const samples = value.samples, times = times_of(value);
   let low = 0, high = times.length - 1;
   if (time <= times[0]) return samples[0];
   if (time >= times[high]) return samples[high];
@@ -102,7 +112,24 @@ function fixed(time, digits) {
   return time.toFixed(digits).replace("-", "\u2212");
 }
 
-// Bar: meshcat's own controls remain under "Open Controls".
+// The controls of meshcat itself, hidden until somebody asks for them.
+function toggle_controls() {
+  const shown = element("view").classList.toggle("meshcat-controls");
+  element("controls").setAttribute("aria-pressed", shown);
+  if (shown) viewer.gui.open();
+}
+element("controls").onclick = KEYS.g = toggle_controls;
+
+// In the dark the background is darker too: still lighter than black pins.
+const dark = matchMedia("(prefers-color-scheme: dark)");
+function set_background() {
+  const [top, bottom] = about.background[+dark.matches];
+  viewer.set_property(["Background"], "top_color", top);
+  viewer.set_property(["Background"], "bottom_color", bottom);
+}
+dark.onchange = set_background;
+
+// Bar.
 for (const speed of SPEEDS) {
   const textContent = `${speed}\u00d7`;
   add(element("speed"), "option", { value: speed, textContent, selected: speed === 1 });
@@ -135,7 +162,10 @@ const SEEKS = {
 };
 document.addEventListener("keydown", (event) => {
   const own = event.target.closest("button, select, input, .dg");
-  if (animator.duration === 0 || event.ctrlKey || event.altKey || event.metaKey) return;
+  if (event.ctrlKey || event.altKey || event.metaKey) return;
+  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  if (key in KEYS && !event.target.closest("select, .dg")) return KEYS[key]();
+  if (animator.duration === 0) return;
   if (own && own !== slider && (own.tagName !== "BUTTON" || event.key === " ")) return;
   if (event.key === " ") toggle();
   else if (event.key in SEEKS) {
@@ -150,6 +180,7 @@ function lay_out() {
   laid_out = animator.actions;
   element("bar").hidden = animator.duration === 0;
   slider.max = animator.duration;
+  set_background();
   element("marks").replaceChildren(...about.passages.map(({ time, text }) => {
     const mark = document.createElement("button");
     mark.style.left = `${100 * (time - about.start) / animator.duration}%`;
@@ -160,6 +191,7 @@ function lay_out() {
   }));
   element("speed").onchange();
   element("loop").onchange();
+  for (const follow of at_layout) follow();
   if (scene === null) away = 1;  // the camera's place has come with the animation
 }
 
@@ -170,11 +202,10 @@ function receive() {
   if (sent === undefined || sent === received) return;
   received = sent;
   about = { ...JSON.parse(sent), live: [] };
-  fill_panel();
   laid_out = null;
 }
 
-(function show() {
+function show() {
   if (about.live) receive();
   if (laid_out !== animator.actions) lay_out();
   slider.value = animator.time;
@@ -187,10 +218,11 @@ function receive() {
   const computed = about.live && animator.duration === 0;
   const time = computed ? state[0] : about.start + animator.time;
   if (scene !== null || animator.duration > 0 || time > 0) step_back();
-  if (about.panel) cells[0].textContent = fixed(time, digits + 1);
-  about.values.forEach((value, i) => {
-    const here = computed ? state[value.live] ?? null : value_at(value.samples, time);
-    cells[i + 1].textContent = shown(here);
-  });
+  if (about.panel) cells.get("t").textContent = fixed(time, digits + 1);
+  for (const [value, cell] of cells) {
+    if (!value.label) continue;
+    cell.textContent = shown(computed ? state[value.live] ?? null : value_at(value, time));
+  }
+  for (const follow of at_frame) follow(time);
   requestAnimationFrame(show);
-})();
+}

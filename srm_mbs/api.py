@@ -279,8 +279,10 @@ def simulate(
         of events with an action and a direction that leave to the forbidden side, which act at once
         (:mod:`srm_mbs.integration.contacts`).
     controller
-        (t, q, v) -> generalised forces (nv,), N and N m, called at every stage; with
-        ``sample_time`` at 0, T, 2 T, ... only, and what it returned is held in between.
+        (t, q, v) -> generalised forces (nv,), N and N m, or a mapping {joint: force} with numbers
+        for joints of one degree of freedom and arrays (joint.nv,) for others; joints that it does
+        not name have none.  Called at every stage; with ``sample_time`` at 0, T, 2 T, ... only,
+        and what it returned is held in between.
     sample_time
         T (s) of a sampled controller.  Steps end on the samples.
     breakpoints : (k,)

@@ -15,7 +15,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.analysis.time_constants import stiff_elements
 from srm_mbs.dynamics.constraints.rows import closure_errors
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.scaling import angle_coordinates, is_angle, row_angles
+from srm_mbs.dynamics.scaling import angle_coordinates, is_angle, row_angles, scene_diagonal
 from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
 from srm_mbs.integration.kernel.backend import backend
 from srm_mbs.model.anchors import Anchor
@@ -96,7 +96,11 @@ def _passages_text(solution: SimulationResult) -> str:
 
 
 def mechanism_rows(mechanism: Mechanism) -> list[tuple[str, str]]:
-    """Degrees of freedom, rank and redundancy of a mechanism: (quantity, value)."""
+    """Size, mass, degrees of freedom, rank and redundancy of a mechanism: (quantity, value).
+
+    The size is the diagonal of the box around joints, centres of mass and anchors at the start, the
+    mass that of all bodies that can move: both show a model in other units than m and kg.
+    """
     structure, source = mechanism.structure, mechanism.source
     found = mechanism.mobility
     count = f"{found.joint_freedoms} - {found.rows} = {found.gruebler}"
@@ -106,9 +110,12 @@ def mechanism_rows(mechanism: Mechanism) -> list[tuple[str, str]]:
     if mechanism.drives:
         freedom += f", {found.degrees_of_freedom} without the drives"
     idle = [f"{', '.join(motion.joints)} ({motion.directions})" for motion in found.idle]
+    mass = sum(body.mass for body in mechanism.model.inertias.tolist()[1:])
     return [
         ("mechanism", mechanism.name),
         ("read from", "Python" if source is None else f"{source.path} ({source.format})"),
+        ("size", f"{scene_diagonal(mechanism, mechanism.q0):.6g} m"),
+        ("mass", f"{mass:.6g} kg"),
         ("degrees of freedom", freedom),
         ("Gruebler count", count),
         ("closure rows", f"{found.rows}"),

@@ -338,9 +338,9 @@ def convert(
 def info(file: ModelFile) -> None:
     """Describe a mechanism: joints, loops, forces, the start.
 
-    With its degrees of freedom, the rank of its closure rows, the rows that are redundant, and what
-    is stiff.  Of a saved run (.npz) first a summary, with the residuals of the singular
-    configurations it met.
+    With its size and mass, its degrees of freedom, the rank of its closure rows, the rows that are
+    redundant, and what is stiff.  Of a saved run (.npz) first a summary, with the residuals of the
+    singular configurations it met.
     """
     from srm_mbs._kernel import missing, remedy
     from srm_mbs.analysis.summary import (

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import ControllerError, safe_repr
+from srm_mbs.errors import ControllerError, InputError, safe_repr
+from srm_mbs.model.mechanism import MechanismData
 
 
 class HeldForce:
@@ -45,21 +46,58 @@ class HeldForce:
 
 
 Controller = Callable[[float, FloatArray, FloatArray], Any]
-"""(t, q, v) -> generalised forces tau (nv,), N and N m."""
+"""(t, q, v) -> generalised forces tau (nv,), N and N m, or a mapping of joint names to theirs."""
 
 
 def evaluate_controller(
-    controller: Controller, t: float, q: FloatArray, v: FloatArray
+    controller: Controller, mechanism: MechanismData, t: float, q: FloatArray, v: FloatArray
 ) -> FloatArray:
     """Generalised forces (nv,) of ``controller``, which gets copies of ``q`` and ``v`` and may
-    return the same array every time.
+    return the same object every time.
+
+    Of a mapping {joint: force}, the force is a number for a joint of one degree of freedom and an
+    array (joint.nv,) for the others; joints that it does not name have none.
 
     Raises
     ------
     ControllerError
-        If it raises, or returns anything but nv finite numbers.
+        If it raises, or returns anything but nv finite numbers or finite forces of known joints.
     """
-    return evaluate_callback("the controller", controller, len(v), "generalised forces", t, q, v)
+    name = "the controller"
+    given = _output(name, controller, t, q, v)
+    if isinstance(given, Mapping):
+        return _forces_of_joints(given, mechanism, t)
+    result = _converted(name, given, t)
+    problem = _problem(result, len(v))
+    if problem is None:
+        return result
+    raise ControllerError(
+        f"{name} returned {problem} at t = {t:.6g} s; it must return {len(v)} finite generalised "
+        "forces, or a mapping of joint names to them",
+        t,
+    )
+
+
+def _forces_of_joints(given: Mapping[Any, Any], mechanism: MechanismData, t: float) -> FloatArray:
+    """The mapping {joint: force} as generalised forces (nv,)."""
+    tau = np.zeros(mechanism.model.nv)
+    for name, force in given.items():
+        own_name = f"the controller's force of the joint {safe_repr(name)}"
+        try:
+            joint = mechanism.joint(name)
+        except InputError as error:
+            raise ControllerError(f"{own_name} at t = {t:.6g} s: {error}", t) from error
+        own = _converted(own_name, force, t)
+        if joint.nv == 1 and own.ndim == 0:
+            own = own.reshape(1)
+        problem = _problem(own, joint.nv)
+        if problem is not None:
+            wanted = "a finite number" if joint.nv == 1 else f"{joint.nv} finite numbers"
+            raise ControllerError(
+                f"{own_name} is {problem} at t = {t:.6g} s; it must be {wanted}", t
+            )
+        tau[joint.idx_v : joint.idx_v + joint.nv] = own
+    return tau
 
 
 def evaluate_callback(
@@ -71,18 +109,43 @@ def evaluate_callback(
     q: FloatArray,
     v: FloatArray,
 ) -> FloatArray:
-    """The result (size,) of a function of the user, as for :func:`evaluate_controller`; messages
-    name the function and its ``values``."""
-    try:
-        result = np.array(function(t, q.copy(), v.copy()), dtype=float, order="C")
-    except Exception as error:
-        raise ControllerError(f"{name} raised {safe_repr(error)} at t = {t:.6g} s", t) from error
-    if result.shape != (size,):
-        problem = f"an array of shape {result.shape}"
-    elif not np.isfinite(result).all():
-        problem = "values that are not finite"
-    else:
+    """The result (size,) of a function of the user, which gets copies of ``q`` and ``v``; messages
+    name the function and its ``values``.
+
+    Raises
+    ------
+    ControllerError
+        If it raises, or returns anything but ``size`` finite numbers.
+    """
+    result = _converted(name, _output(name, function, t, q, v), t)
+    problem = _problem(result, size)
+    if problem is None:
         return result
     raise ControllerError(
         f"{name} returned {problem} at t = {t:.6g} s; it must return {size} finite {values}", t
     )
+
+
+def _output(name: str, function: Controller, t: float, q: FloatArray, v: FloatArray) -> Any:
+    """The result of ``function``, unchecked."""
+    try:
+        return function(t, q.copy(), v.copy())
+    except Exception as error:
+        raise ControllerError(f"{name} raised {safe_repr(error)} at t = {t:.6g} s", t) from error
+
+
+def _converted(name: str, given: Any, t: float) -> FloatArray:
+    """A copy of ``given`` as an array of numbers."""
+    try:
+        return np.array(given, dtype=float, order="C")
+    except Exception as error:
+        raise ControllerError(f"{name} raised {safe_repr(error)} at t = {t:.6g} s", t) from error
+
+
+def _problem(result: FloatArray, size: int) -> str | None:
+    """Why ``result`` is not ``size`` finite numbers; None if it is."""
+    if result.shape != (size,):
+        return f"an array of shape {result.shape}"
+    if not np.isfinite(result).all():
+        return "values that are not finite"
+    return None

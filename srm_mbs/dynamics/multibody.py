@@ -323,7 +323,7 @@ class Mechanics(Manifold):
         """Generalised forces (nv,) of the controller; 0 without one."""
         if self._controller is None:
             return np.zeros(self.nv)
-        return evaluate_controller(self._controller, t, q, v)
+        return evaluate_controller(self._controller, self.mechanism, t, q, v)
 
     def damping_force(self, v: FloatArray) -> FloatArray:
         """Joint damping -d v, for the rates v (nv,) or (n, nv)."""

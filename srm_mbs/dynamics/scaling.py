@@ -151,17 +151,7 @@ def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> 
     model = mechanism.model
     data = workspace(model)
     pin.computeJointJacobians(model, data, q)
-    points = []
-    for joint in range(1, model.njoints):
-        points.append(data.oMi[joint].translation.copy())
-        if model.inertias[joint].mass > 0.0:
-            points.append(data.oMi[joint].act(model.inertias[joint].lever))
-    for joint, point in _anchors(mechanism):
-        points.append(data.oMi[joint].act(point))
-    corners = np.array(points) if points else np.zeros((1, 3))
-    diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
-    known_to = RELATIVE_ROUNDING * max(float(np.abs(corners).max()), _gyration(model))
-    length = diagonal if diagonal > known_to else 1.0
+    length = _diagonal(mechanism, data) or 1.0
     coordinate = np.where(_angle_components(data), 1.0, length)
     rate = float(np.sqrt(np.linalg.norm(model.gravity.linear) / length))
     if rate == 0.0:
@@ -172,6 +162,30 @@ def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> 
         rates = rates[rates > 0.0]
         rate = float(np.median(rates)) if rates.size else 1.0
     return Units(length, coordinate, rate)
+
+
+def scene_diagonal(mechanism: MechanismData, q: FloatArray) -> float:
+    """Diagonal (m) of the bounding box of joints, centres of mass and anchors at q (nq,); 0 where
+    they are all at one point, up to rounding."""
+    data = workspace(mechanism.model)
+    pin.forwardKinematics(mechanism.model, data, q)
+    return _diagonal(mechanism, data)
+
+
+def _diagonal(mechanism: MechanismData, data: pin.Data) -> float:
+    """:func:`scene_diagonal` at the placements of ``data``."""
+    model = mechanism.model
+    points = []
+    for joint in range(1, model.njoints):
+        points.append(data.oMi[joint].translation.copy())
+        if model.inertias[joint].mass > 0.0:
+            points.append(data.oMi[joint].act(model.inertias[joint].lever))
+    for joint, point in _anchors(mechanism):
+        points.append(data.oMi[joint].act(point))
+    corners = np.array(points) if points else np.zeros((1, 3))
+    diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
+    known_to = RELATIVE_ROUNDING * max(float(np.abs(corners).max()), _gyration(model))
+    return diagonal if diagonal > known_to else 0.0
 
 
 def _gyration(model: pin.Model) -> float:

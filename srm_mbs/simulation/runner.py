@@ -247,7 +247,8 @@ def checked_options(mechanism: Any, options: RunOptions) -> RunOptions:
         raise InputError(
             f"controller = {safe_repr(options.controller)} cannot be called",
             element="controller",
-            remedy="Give a function of (t, q, v) that returns the generalised forces",
+            remedy="Give a function of (t, q, v) that returns the generalised forces, or "
+            "{joint: force}",
         )
     return checked_accuracy(mechanism, options, t0, t_end)
 
@@ -447,7 +448,7 @@ def sampler(
     """A function (t, state) that samples ``controller`` for ``held`` and for the kernel."""
 
     def sample(t: float, state: FloatArray) -> None:
-        force = evaluate_controller(controller, t, *system.split(state))
+        force = evaluate_controller(controller, system.mechanism, t, *system.split(state))
         held.hold(t, force)
         if kernel_system is not None:
             kernel_system.hold(t, force, True)

@@ -160,6 +160,32 @@ def test_info_shows_degrees_of_freedom_rank_redundant_rows_joints_and_loops() ->
     assert float(gap.removesuffix(" m")) < 1e-12
 
 
+def test_info_shows_size_and_mass() -> None:
+    """Two bars of 2 m at right angles, 45 degrees to the slider's line: a box of 2 sqrt 2 by
+    sqrt 2."""
+    output = run("info", "slider_crank_slider")
+    assert row(output, "size") == f"{np.sqrt(10.0):.6g} m"
+    assert row(output, "mass") == "2.5 kg"  # two bars of 1 kg and a slider of 0.5 kg
+    urdf = (ROOT / "urdf" / "four_bar.urdf").read_text(encoding="utf-8")
+    masses = [float(mass) for mass in re.findall(r'mass value="([^"]+)"', urdf)]
+    assert row(run("info", "four_bar"), "mass") == f"{sum(masses):.6g} kg"
+
+
+def test_a_mechanism_at_one_point_has_no_size(tmp_path: Path) -> None:
+    """It shows 0 m and not the 1 m that its motion is measured in; the root link does not move."""
+    path = tmp_path / "wheel.urdf"
+    inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    path.write_text(
+        '<robot name="wheel"><link name="base"><inertial><mass value="9"/>'
+        f'{inertia}</inertial></link><link name="rim"><inertial><mass value="2.5"/>{inertia}'
+        '</inertial></link><joint name="axle" type="continuous"><parent link="base"/>'
+        '<child link="rim"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    output = run("info", path)
+    assert row(output, "size") == "0 m"
+    assert row(output, "mass") == "2.5 kg"
+
+
 def test_info_tells_what_was_read_and_what_was_ignored(tmp_path: Path) -> None:
     assert row(run("info", "four_bar"), "read from").endswith("four_bar.toml (URDF)")
     assert row(run("info", "n_four_bar_3"), "read from") == "n_four_bar_3, generated (URDF)"

@@ -14,7 +14,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from tests.support.bundled import finished, load
-from tests.support.mechanisms import add_link, floating_ring, rod
+from tests.support.mechanisms import add_link, along_x, floating_ring, rod
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 
@@ -348,6 +348,54 @@ def test_inverse_dynamics_and_equilibria_have_the_same_reactions() -> None:
         if "world" in {anchor.link for anchor in loop.anchors}
     )
     assert sum(grounded) + on_ground == pytest.approx(weight, rel=1e-9)
+
+
+# --- couplings ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "slopes"),
+    [
+        # s = 0.1 + 0.05 y + 0.2 y^2 - 0.03 y^3 of the last angle y.
+        ({"joints": ("slide", "arm")}, lambda p, q: [0.0, -p.deriv()(q[1]), 1.0]),
+        # 2 s - 0.4 phi = p(y), y = 0.5 phi + phi_2: a row of all three joints.
+        (
+            {
+                "joints": ("slide", "crank", "arm"),
+                "coefficients": (2.0, -0.4, 0.0),
+                "arguments": (0.0, 0.5, 1.0),
+            },
+            lambda p, q: [
+                -0.4 - 0.5 * p.deriv()(0.5 * q[0] + q[1]),
+                -p.deriv()(0.5 * q[0] + q[1]),
+                2.0,
+            ],
+        ),
+    ],
+    ids=["two joints", "three joints"],
+)
+def test_a_polynomial_coupling_loads_each_axis_by_its_slope(kind: Any, slopes: Any) -> None:
+    """A spatial arm whose slider follows its angles by a cam.  The bodies are in balance; on the
+    axes are the couplings' forces, which are in the ratio of the derivatives of its equation."""
+    powers = (0.1, 0.05, 0.2, -0.03)
+    model = pin.Model()
+    crank = add_link(model, 0, pin.JointModelRY(), "crank", rod(1.2))
+    arm = add_link(model, crank, pin.JointModelRZ(), "arm", rod(0.7), along_x(1.0))
+    add_link(model, arm, pin.JointModelPX(), "slide", rod(0.5, 0.3), along_x(0.4))
+    coupling = srm.LoopClosure("coupling", name="cam", polynomial=powers, **kind)
+    bare = srm.Mechanism(model, (coupling,))
+    start = srm.assemble(bare, {"crank": 0.3, "arm": -0.7}, {"crank": 1.0, "arm": 2.0})
+    run = finished(bare.with_state(start.q, start.v), T_END, t_eval=np.linspace(0.0, T_END, 7))
+    assert imbalance(run) < 1e-9
+    p = np.polynomial.Polynomial(powers)
+    rows = np.array([slopes(p, q) for q in run.q])
+    forces = np.column_stack([on_axes(run)[name] for name in ("crank", "arm", "slide")])
+    lam = forces[:, 2] / rows[:, 2]
+    assert np.abs(lam).min() > 0.1
+    assert_close(forces, lam[:, None] * rows, atol=1e-9 * np.abs(forces).max())
+    for joint, own in zip(kind["joints"], run.coupling_forces["cam"].T):
+        found = on_axes(run)[joint]
+        assert_close(own, found, atol=1e-9 * np.abs(forces).max())
 
 
 # --- runs of all kinds ----------------------------------------------------------------------------

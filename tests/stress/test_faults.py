@@ -93,7 +93,9 @@ def test_a_controller_that_returns_no_number_ends_the_run_where_it_did(
     assert 0.1 < solution.t[-1] <= 0.5
 
 
-@pytest.mark.parametrize("value", [None, [1.0, 2.0], "x", {}, [None, 0.0, 0.0], np.zeros((3, 2))])
+@pytest.mark.parametrize(
+    "value", [None, [1.0, 2.0], "x", {"elbow": 1.0}, [None, 0.0, 0.0], np.zeros((3, 2))]
+)
 def test_a_controller_that_returns_something_else_ends_the_run(
     value: Any, four_bar: srm.Mechanism
 ) -> None:

@@ -12,9 +12,7 @@ Where a step passes, or almost touches, a singular configuration, the rates of i
 rounding of the stage over its distance to that configuration, which the weights of a continuous
 extension multiply.  The accepted states and their rates do not: they lie further away.  States
 within such a step follow from Hermite interpolation (:class:`HermiteStep`): the polynomial through
-the states and rates at the nearest ends of steps, in the chart at the start of the step.  Where a
-step ends next to a slow turn its rates carry that rounding too; the polynomial that leaves such
-ends out is taken if it is confirmed better.
+the states and rates at the nearest ends of steps, in the chart at the start of the step.
 """
 
 from __future__ import annotations
@@ -43,11 +41,6 @@ HERMITE_NODES = (4, 6, 8)
 NODE_SPACING = 0.1
 """Smallest distance of the ends of steps that are used, over the length of the step: closer ones
 would magnify their rounding."""
-ROUNDED_NODE = 1.5e-3
-"""sigma below which the rates at the end of a step may carry more rounding than interpolation
-between ends further away errs."""
-NODES_BESIDE = 4
-"""Ends that are looked at in addition where some are left out, and the least that remain."""
 CLOSE_SIGMA = 1.0
 """Smallest sigma of a step, over the change of sigma in the step, below which the step is close to
 a singular configuration."""
@@ -140,15 +133,8 @@ class HermiteStep:
         self._h = steps.times[step + 1] - steps.times[step]
         best = np.inf
         layer = steps.layers[step]
-        ends = [self._nodes(count) for count in HERMITE_NODES]
-        away = [self._away(count) for count in HERMITE_NODES]
-        variants = [(None, ends)]
-        if away != ends:
-            variants.append((None, away))
-        if layer[1] > 0.0:
-            variants.append((layer, ends))
-        for self._layer, nodes in variants:
-            polynomials = [self._through(own) for own in nodes]
+        for self._layer in (None, layer) if layer[1] > 0.0 else (None,):
+            polynomials = [self._through(count) for count in HERMITE_NODES]
             values = [polynomial(self._variable(COMPARED_AT)[0]) for polynomial in polynomials]
             changes = [float(np.abs(b - a).max()) for a, b in pairwise(values)]
             if min(changes) < best:
@@ -190,20 +176,6 @@ class HermiteStep:
                 j += 1
         return sorted(before + after)
 
-    def _away(self, count: int) -> list[int]:
-        """As :meth:`_nodes`, without ends whose rates may carry rounding; all if few others are
-        left."""
-        nodes = self._nodes(count)
-        if min(map(self._sigma, nodes)) < ROUNDED_NODE:
-            away = [i for i in self._nodes(count + NODES_BESIDE) if self._sigma(i) >= ROUNDED_NODE]
-            nodes = away if len(away) >= NODES_BESIDE else nodes
-        return nodes
-
-    def _sigma(self, node: int) -> float:
-        """sigma at an end of a step."""
-        sigmas = self._steps.sigmas
-        return float(sigmas[node, 0] if node < len(sigmas) else sigmas[-1, -1])
-
     def _moved(self, node: int) -> FloatArray:
         """Motion (m,) from the step to a node, in the charts of the steps between, whole turns
         included."""
@@ -220,7 +192,7 @@ class HermiteStep:
                 moved += weights @ np.tensordot(h[chosen], rates, axes=1)
         return moved if node > self._step else -moved
 
-    def _through(self, nodes: list[int]) -> Callable[[FloatArray], FloatArray]:
+    def _through(self, count: int) -> Callable[[FloatArray], FloatArray]:
         from scipy.interpolate import KroghInterpolator
 
         steps = self._steps
@@ -228,7 +200,7 @@ class HermiteStep:
         t0 = steps.times[self._step]
         points: list[float] = []
         values: list[FloatArray] = []
-        for i in nodes:
+        for i in self._nodes(count):
             delta = self._system.difference(self._start, steps.states[i], self._moved(i))
             rate = steps.rate_at(i, last)
             at, growth = self._variable((steps.times[i] - t0) / self._h)

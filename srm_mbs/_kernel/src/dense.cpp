@@ -205,20 +205,6 @@ std::vector<long> DenseOutput::nodes(const System& system, long step, int count)
     return before;
 }
 
-// As nodes(), without ends whose rates may carry rounding; all if few others are left.
-std::vector<long> DenseOutput::nodes_away(const System& system, long step, int count) const {
-    const std::size_t width = scheme_of(step).abscissae.size();
-    const auto rounded = [&](long node) {
-        const long at = node < steps_.count ? node * width : steps_.count * width - 1;
-        return steps_.sigmas[at] < constants_.rounded_node;
-    };
-    std::vector<long> all = nodes(system, step, count);
-    if (std::none_of(all.begin(), all.end(), rounded)) return all;
-    std::vector<long> away = nodes(system, step, count + constants_.nodes_beside);
-    away.erase(std::remove_if(away.begin(), away.end(), rounded), away.end());
-    return static_cast<int>(away.size()) < constants_.nodes_beside ? all : away;
-}
-
 // Motion of the positions from the step to a node, whole turns included: the sum of the motions of
 // the steps between, each in its own chart.
 void DenseOutput::motion(long step, long node, double* out) const {
@@ -246,15 +232,15 @@ double DenseOutput::variable(long step, double theta, bool in_layer, double* gro
 }
 
 // Divided differences of the states and rates at ends of steps, in the chart of the step.
-DenseOutput::Polynomial DenseOutput::hermite(System& system, long step,
-                                             const std::vector<long>& nodes, bool in_layer) {
+DenseOutput::Polynomial DenseOutput::hermite(System& system, long step, int count,
+                                             bool in_layer) {
     const double *times = steps_.times, *start = steps_.states + step * nx_;
     const double h = times[step + 1] - times[step];
     Polynomial out;
     out.in_layer = in_layer;
     std::vector<double> slopes, rate(n_), near(n_ / 2);
     const long last = smooth_interval(step).second;
-    for (long i : nodes) {
+    for (long i : nodes(system, step, count)) {
         double growth;
         const double at = variable(step, (times[i] - times[step]) / h, in_layer, &growth);
         motion(step, i, near.data());
@@ -302,16 +288,10 @@ const DenseOutput::Polynomial& DenseOutput::best_polynomial(System& system, long
     if (!out.points.empty()) return out;
     const bool layer = steps_.layers && steps_.layers[2 * step + 1] > 0.0;
     double best = std::numeric_limits<double>::infinity();
-    std::vector<std::vector<long>> ends, away;
-    for (int count : constants_.nodes) {
-        ends.push_back(nodes(system, step, count));
-        away.push_back(nodes_away(system, step, count));
-    }
-    for (const auto& [in_layer, chosen] :
-         {std::pair(false, &ends), {false, &away}, {true, &ends}}) {
-        if (in_layer ? !layer : chosen == &away && away == ends) continue;
+    for (const bool in_layer : {false, true}) {
+        if (in_layer && !layer) break;
         std::vector<Polynomial> tried;
-        for (const auto& own : *chosen) tried.push_back(hermite(system, step, own, in_layer));
+        for (int count : constants_.nodes) tried.push_back(hermite(system, step, count, in_layer));
         double changes[2] = {0.0, 0.0};
         std::vector<double> a(n_), b(n_);
         for (int k = 0; k < 2; ++k)
@@ -323,7 +303,7 @@ const DenseOutput::Polynomial& DenseOutput::best_polynomial(System& system, long
                     changes[k] = std::max(changes[k], std::abs(b[i] - a[i]));
             }
         const double change = std::min(changes[0], changes[1]);
-        if (!(change < best) && !out.points.empty()) continue;
+        if (in_layer && !(change < best)) break;
         best = change;
         out = tried[changes[1] <= changes[0] ? 1 : 0];
     }

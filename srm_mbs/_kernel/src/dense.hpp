@@ -28,8 +28,6 @@ struct Extension {
 #define SRM_DENSE_CONSTANTS(field)                                                            \
     field(std::vector<int>, nodes)     /* ends of steps of the three polynomials */           \
     field(double, spacing)             /* smallest distance of nodes, over the step */        \
-    field(double, rounded_node)        /* sigma at nodes that may be left out */              \
-    field(int, nodes_beside)           /* more nodes where some are, and the least left */    \
     field(double, close)               /* sigma next to a singularity, over its change per step */ \
     field(double, branch_below)        /* the same, of lingering motions, as it is */              \
     field(std::vector<double>, probes) /* fractions at which polynomials are compared */      \
@@ -80,8 +78,7 @@ private:
     const Polynomial& best_polynomial(System& system, long step);
     std::vector<long> nodes(const System& system, long step, int count) const;
     void motion(long step, long node, double* out) const;
-    std::vector<long> nodes_away(const System& system, long step, int count) const;
-    Polynomial hermite(System& system, long step, const std::vector<long>& nodes, bool in_layer);
+    Polynomial hermite(System& system, long step, int count, bool in_layer);
     double variable(long step, double theta, bool in_layer, double* growth = nullptr) const;
     void value(const Polynomial& polynomial, double theta, double* out) const;
 

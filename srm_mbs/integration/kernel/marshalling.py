@@ -360,8 +360,6 @@ def dense_constants() -> Any:
     return _core.DenseConstants(
         nodes=list(dense_output.HERMITE_NODES),
         spacing=dense_output.NODE_SPACING,
-        rounded_node=dense_output.ROUNDED_NODE,
-        nodes_beside=dense_output.NODES_BESIDE,
         close=dense_output.CLOSE_SIGMA,
         branch_below=branch_nodes.BRANCH_SIGMA,
         probes=dense_output.COMPARED_AT,

@@ -12,7 +12,9 @@ Where a step passes, or almost touches, a singular configuration, the rates of i
 rounding of the stage over its distance to that configuration, which the weights of a continuous
 extension multiply.  The accepted states and their rates do not: they lie further away.  States
 within such a step follow from Hermite interpolation (:class:`HermiteStep`): the polynomial through
-the states and rates at the nearest ends of steps, in the chart at the start of the step.
+the states and rates at the nearest ends of steps, in the chart at the start of the step.  Where a
+step ends next to a slow turn its rates carry that rounding too; the polynomial that leaves such
+ends out is taken if it is confirmed better.
 """
 
 from __future__ import annotations
@@ -41,6 +43,10 @@ HERMITE_NODES = (4, 6, 8)
 NODE_SPACING = 0.1
 """Smallest distance of the ends of steps that are used, over the length of the step: closer ones
 would magnify their rounding."""
+AWAY_REACH = 16
+"""Steps to each side among whose ends those are looked for whose rates carry no rounding."""
+LEAST_AWAY = 4
+"""Fewest such ends that are used without the others."""
 CLOSE_SIGMA = 1.0
 """Smallest sigma of a step, over the change of sigma in the step, below which the step is close to
 a singular configuration."""
@@ -133,8 +139,15 @@ class HermiteStep:
         self._h = steps.times[step + 1] - steps.times[step]
         best = np.inf
         layer = steps.layers[step]
-        for self._layer in (None, layer) if layer[1] > 0.0 else (None,):
-            polynomials = [self._through(count) for count in HERMITE_NODES]
+        ends = [self._nodes(count) for count in HERMITE_NODES]
+        away = [self._away(count) for count in HERMITE_NODES]
+        variants = [(None, ends)]
+        if away != ends:
+            variants.append((None, away))
+        if layer[1] > 0.0:
+            variants.append((layer, ends))
+        for self._layer, nodes in variants:
+            polynomials = [self._through(own) for own in nodes]
             values = [polynomial(self._variable(COMPARED_AT)[0]) for polynomial in polynomials]
             changes = [float(np.abs(b - a).max()) for a, b in pairwise(values)]
             if min(changes) < best:
@@ -151,30 +164,39 @@ class HermiteStep:
         beside = (self._steps.times[self._step] - centre + theta * self._h) / width
         return np.arcsinh(beside), self._h / width / np.hypot(1.0, beside)
 
-    def _nodes(self, count: int) -> list[int]:
-        """Indices of up to ``count`` ends of steps around the step, none too close together."""
+    def _nodes(self, count: int, least_sigma: float = 0.0, reach: int | None = None) -> list[int]:
+        """Indices of up to ``count`` ends of steps around the step, none too close together, with
+        ``least_sigma`` at least, and no more than ``reach`` steps away."""
         times, near = self._steps.times, NODE_SPACING * self._h
         states, reachable = self._steps.states, self._system.reachable
         first, last = self._interval
-        before, after = [self._step], [self._step + 1]
-        i, j = self._step - 1, self._step + 2
+        i, j = self._step, self._step + 1
+        if reach is not None:
+            first, last = max(first, i - reach), min(last, j + reach)
+        before: list[int] = []
+        after: list[int] = []
         while len(before) + len(after) < count and (i >= first or j <= last):
             left = i >= first and (j > last or len(before) <= len(after))
-            if left:
-                if times[before[-1]] - times[i] >= near:
-                    if reachable(self._start, states[i]):
-                        before.append(i)
-                    else:
-                        first = i
-                i -= 1
-            else:
-                if times[j] - times[after[-1]] >= near:
-                    if reachable(self._start, states[j]):
-                        after.append(j)
-                    else:
-                        last = j
-                j += 1
+            node, own = (i, before) if left else (j, after)
+            if not own or abs(times[own[-1]] - times[node]) >= near:
+                if not reachable(self._start, states[node]):
+                    first, last = (node + 1, last) if left else (first, node - 1)
+                elif self._sigma(node) >= least_sigma:
+                    own.append(node)
+            i, j = (i - 1, j) if left else (i, j + 1)
         return sorted(before + after)
+
+    def _away(self, count: int) -> list[int]:
+        """As :meth:`_nodes`, without ends whose rates may carry rounding; all if few others are
+        near, or none on one side of the step: polynomials are no extrapolations."""
+        away = self._nodes(count, BRANCH_SIGMA, AWAY_REACH)
+        within = len(away) >= LEAST_AWAY and away[0] <= self._step < away[-1]
+        return away if within else self._nodes(count)
+
+    def _sigma(self, node: int) -> float:
+        """sigma at an end of a step."""
+        sigmas = self._steps.sigmas
+        return float(sigmas[node, 0] if node < len(sigmas) else sigmas[-1, -1])
 
     def _moved(self, node: int) -> FloatArray:
         """Motion (m,) from the step to a node, in the charts of the steps between, whole turns
@@ -192,7 +214,7 @@ class HermiteStep:
                 moved += weights @ np.tensordot(h[chosen], rates, axes=1)
         return moved if node > self._step else -moved
 
-    def _through(self, count: int) -> Callable[[FloatArray], FloatArray]:
+    def _through(self, nodes: list[int]) -> Callable[[FloatArray], FloatArray]:
         from scipy.interpolate import KroghInterpolator
 
         steps = self._steps
@@ -200,7 +222,7 @@ class HermiteStep:
         t0 = steps.times[self._step]
         points: list[float] = []
         values: list[FloatArray] = []
-        for i in self._nodes(count):
+        for i in nodes:
             delta = self._system.difference(self._start, steps.states[i], self._moved(i))
             rate = steps.rate_at(i, last)
             at, growth = self._variable((steps.times[i] - t0) / self._h)

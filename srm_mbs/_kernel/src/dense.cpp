@@ -174,35 +174,46 @@ void DenseOutput::extended(System& system, long step, double theta, double* out)
     system.retract(out, delta_.data(), out);
 }
 
-// Up to `count` ends of steps around the step, none too close together.
-std::vector<long> DenseOutput::nodes(const System& system, long step, int count) const {
+// Up to `count` ends of steps around the step, none too close together, with `least_sigma` at least,
+// and no more than `reach` steps away.
+std::vector<long> DenseOutput::nodes(const System& system, long step, int count,
+                                     double least_sigma, long reach) const {
     const double *times = steps_.times, *start = steps_.states + step * nx_;
     const double near = constants_.spacing * (times[step + 1] - times[step]);
-    std::vector<long> before{step}, after{step + 1};
-    long i = step - 1, j = step + 2;
+    const long width = static_cast<long>(scheme_of(step).abscissae.size());
     // Rates jump at breakpoints: a polynomial has no nodes beyond.
     auto [first, last] = smooth_interval(step);
-    const auto reachable = [&](long node) {
-        return system.reachable(start, steps_.states + node * nx_);
-    };
+    long i = step, j = step + 1;
+    if (reach < i - first) first = i - reach;
+    if (reach < last - j) last = j + reach;
+    std::vector<long> before, after;
     while (static_cast<int>(before.size() + after.size()) < count && (i >= first || j <= last)) {
-        if (i >= first && (j > last || before.size() <= after.size())) {
-            if (times[before.back()] - times[i] >= near) {
-                if (reachable(i)) before.push_back(i);
-                else first = i;
-            }
-            --i;
-        } else {
-            if (times[j] - times[after.back()] >= near) {
-                if (reachable(j)) after.push_back(j);
-                else last = j;
-            }
-            ++j;
+        const bool left = i >= first && (j > last || before.size() <= after.size());
+        const long node = left ? i-- : j++;
+        std::vector<long>& own = left ? before : after;
+        if (!own.empty() && std::abs(times[own.back()] - times[node]) < near) continue;
+        if (!system.reachable(start, steps_.states + node * nx_)) {
+            if (left) first = node + 1;
+            else last = node - 1;
+        } else if (least_sigma <= 0.0 ||
+                   steps_.sigmas[node < steps_.count ? node * width : steps_.count * width - 1] >=
+                       least_sigma) {
+            own.push_back(node);
         }
     }
     before.insert(before.end(), after.begin(), after.end());
     std::sort(before.begin(), before.end());
     return before;
+}
+
+// As nodes(), without ends whose rates may carry rounding; all if few others are near, or none on
+// one side of the step: polynomials are no extrapolations.
+std::vector<long> DenseOutput::nodes_away(const System& system, long step, int count) const {
+    std::vector<long> away =
+        nodes(system, step, count, constants_.branch_below, constants_.away_reach);
+    const bool within = static_cast<int>(away.size()) >= constants_.least_away &&
+                        away.front() <= step && away.back() > step;
+    return within ? away : nodes(system, step, count);
 }
 
 // Motion of the positions from the step to a node, whole turns included: the sum of the motions of
@@ -232,15 +243,15 @@ double DenseOutput::variable(long step, double theta, bool in_layer, double* gro
 }
 
 // Divided differences of the states and rates at ends of steps, in the chart of the step.
-DenseOutput::Polynomial DenseOutput::hermite(System& system, long step, int count,
-                                             bool in_layer) {
+DenseOutput::Polynomial DenseOutput::hermite(System& system, long step,
+                                             const std::vector<long>& nodes, bool in_layer) {
     const double *times = steps_.times, *start = steps_.states + step * nx_;
     const double h = times[step + 1] - times[step];
     Polynomial out;
     out.in_layer = in_layer;
     std::vector<double> slopes, rate(n_), near(n_ / 2);
     const long last = smooth_interval(step).second;
-    for (long i : nodes(system, step, count)) {
+    for (long i : nodes) {
         double growth;
         const double at = variable(step, (times[i] - times[step]) / h, in_layer, &growth);
         motion(step, i, near.data());
@@ -288,10 +299,16 @@ const DenseOutput::Polynomial& DenseOutput::best_polynomial(System& system, long
     if (!out.points.empty()) return out;
     const bool layer = steps_.layers && steps_.layers[2 * step + 1] > 0.0;
     double best = std::numeric_limits<double>::infinity();
-    for (const bool in_layer : {false, true}) {
-        if (in_layer && !layer) break;
+    std::vector<std::vector<long>> ends, away;
+    for (int count : constants_.nodes) {
+        ends.push_back(nodes(system, step, count));
+        away.push_back(nodes_away(system, step, count));
+    }
+    for (const auto& [in_layer, chosen] :
+         {std::pair(false, &ends), {false, &away}, {true, &ends}}) {
+        if (in_layer ? !layer : chosen == &away && away == ends) continue;
         std::vector<Polynomial> tried;
-        for (int count : constants_.nodes) tried.push_back(hermite(system, step, count, in_layer));
+        for (const auto& own : *chosen) tried.push_back(hermite(system, step, own, in_layer));
         double changes[2] = {0.0, 0.0};
         std::vector<double> a(n_), b(n_);
         for (int k = 0; k < 2; ++k)
@@ -303,7 +320,7 @@ const DenseOutput::Polynomial& DenseOutput::best_polynomial(System& system, long
                     changes[k] = std::max(changes[k], std::abs(b[i] - a[i]));
             }
         const double change = std::min(changes[0], changes[1]);
-        if (in_layer && !(change < best)) break;
+        if (!(change < best) && !out.points.empty()) continue;
         best = change;
         out = tried[changes[1] <= changes[0] ? 1 : 0];
     }

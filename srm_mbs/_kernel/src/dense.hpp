@@ -1,6 +1,7 @@
 // The state at any time of a run: dense_output.py.
 #pragma once
 
+#include <limits>
 #include <utility>
 #include <vector>
 
@@ -28,6 +29,8 @@ struct Extension {
 #define SRM_DENSE_CONSTANTS(field)                                                            \
     field(std::vector<int>, nodes)     /* ends of steps of the three polynomials */           \
     field(double, spacing)             /* smallest distance of nodes, over the step */        \
+    field(int, away_reach)             /* steps to look for nodes away from branch_below */   \
+    field(int, least_away)             /* fewest of these that are used alone */              \
     field(double, close)               /* sigma next to a singularity, over its change per step */ \
     field(double, branch_below)        /* the same, of lingering motions, as it is */              \
     field(std::vector<double>, probes) /* fractions at which polynomials are compared */      \
@@ -76,9 +79,11 @@ private:
     const std::vector<double>& extra_rates(System& system, long step, double h);
     void extended(System& system, long step, double theta, double* out);
     const Polynomial& best_polynomial(System& system, long step);
-    std::vector<long> nodes(const System& system, long step, int count) const;
+    std::vector<long> nodes(const System& system, long step, int count, double least_sigma = 0.0,
+                            long reach = std::numeric_limits<long>::max()) const;
     void motion(long step, long node, double* out) const;
-    Polynomial hermite(System& system, long step, int count, bool in_layer);
+    std::vector<long> nodes_away(const System& system, long step, int count) const;
+    Polynomial hermite(System& system, long step, const std::vector<long>& nodes, bool in_layer);
     double variable(long step, double theta, bool in_layer, double* growth = nullptr) const;
     void value(const Polynomial& polynomial, double theta, double* out) const;
 

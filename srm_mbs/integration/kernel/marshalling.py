@@ -360,6 +360,8 @@ def dense_constants() -> Any:
     return _core.DenseConstants(
         nodes=list(dense_output.HERMITE_NODES),
         spacing=dense_output.NODE_SPACING,
+        away_reach=dense_output.AWAY_REACH,
+        least_away=dense_output.LEAST_AWAY,
         close=dense_output.CLOSE_SIGMA,
         branch_below=branch_nodes.BRANCH_SIGMA,
         probes=dense_output.COMPARED_AT,

@@ -21,6 +21,27 @@ if srm.backend() == "python":
     os.environ["SRM_MBS_BACKEND"] = "python"
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--default-backend-only",
+        action="store_true",
+        help="Leave out the cases of tests that name their backend: with another default backend "
+        "they are the same.",
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.option.default_backend_only:
+        return
+
+    def named(item: pytest.Item) -> bool:
+        case = getattr(item, "callspec", None)
+        return case is not None and case.params.get("backend", "auto") != "auto"
+
+    config.hook.pytest_deselected(items=[item for item in items if named(item)])
+    items[:] = [item for item in items if not named(item)]
+
+
 def pytest_report_header() -> str:
     """The backend of the tests, and why it is not the kernel."""
     reason = (

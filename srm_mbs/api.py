@@ -36,6 +36,8 @@ from srm_mbs.visualization.animation.joint_motion import AnimationMixin
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from srm_mbs.analysis.accuracy.certificate import Certificate
+
 Outcome = TypeVar("Outcome", bound=RunOutcome)
 
 
@@ -105,7 +107,25 @@ class Solution(AnimationMixin, SimulationResult):
 
         save_solution(self, checked_path(path), full_paths)
 
-    def plot(self, path: str | Path | None = None, kind: str = "run", **options: Any) -> Figure:
+    def plot(
+        self,
+        path: str | Path | None = None,
+        kind: str = "run",
+        *,
+        joints: Sequence[str] | None = None,
+        accelerations: bool = False,
+        loops: Sequence[str] | None = None,
+        rows: bool = False,
+        points: Sequence[Anchor | str] | None = None,
+        x: str | None = None,
+        unit: str | None = None,
+        at: Sequence[float] | None = None,
+        crank: str | None = None,
+        view: Any = None,
+        title: str | None = None,
+        size: str | tuple[float, float] | None = None,
+        dpi: float | None = None,
+    ) -> Figure:
         """A picture of the run; docs/plots.md shows each kind.
 
         Parameters
@@ -121,18 +141,35 @@ class Solution(AnimationMixin, SimulationResult):
             ``sigma``: sigma, all kinds of steps, and the error estimates.  ``phase``: rate over
             position of joints.  ``path``: paths of points in space.  ``point``: position, velocity
             and acceleration of points.  ``poses``: the mechanism at several times in one picture.
-        **options
-            ``joints`` of ``state``, ``phase`` and ``reactions``: names, by default as many as fit.
-            ``accelerations`` of ``state``: whether to draw them, too.  ``loops`` of ``reactions``:
-            names; ``rows``: whether to draw the multiplier of each row.  ``points`` of ``path`` and
-            ``point``: anchors such as ``srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))``, or names of
-            points of the mechanism.  ``x`` of ``state``, ``reactions`` and ``point``: joint on the
-            horizontal axis instead of time; ``unit``: its unit, ``"rad"`` or ``"deg"``, ``"m"`` or
-            ``"mm"``.  ``at``, ``crank``, ``points``, ``view`` and ``unit`` of ``poses``: times (s),
-            or positions (degrees, m) of the crank; points whose paths are drawn; direction of view;
-            unit of the axes, ``"m"`` or ``"mm"``.  Of every kind ``title``: the title; ``size``:
-            ``"column"`` (3.5 inch wide), ``"page"`` (7 inch) or width and height (inch); ``dpi``:
-            dots per inch of a png.
+        joints
+            Names, by default as many as fit: with ``state``, ``phase`` and ``reactions``.
+        accelerations
+            Whether to draw accelerations, too: with ``state``.
+        loops
+            Names of closures: with ``reactions``.
+        rows
+            Whether to draw the multiplier of each row: with ``reactions``.
+        points
+            Anchors such as ``srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))``, or names of points of the
+            mechanism: with ``path`` and ``point``, and with ``poses``, which draws their paths.
+        x
+            Joint on the horizontal axis instead of time: with ``state``, ``reactions`` and
+            ``point``.
+        unit
+            Unit of that joint, ``"rad"`` or ``"deg"``, ``"m"`` or ``"mm"``; with ``poses`` that of
+            the axes, ``"m"`` or ``"mm"``.
+        at
+            Times (s), or positions of the crank (degrees, m): with ``poses``.
+        crank
+            Joint of these positions: with ``poses``.
+        view
+            Direction of view, ``"x"``, ``"y"``, ``"z"`` or a vector: with ``poses``.
+        title
+            The title.
+        size
+            ``"column"`` (3.5 inch wide), ``"page"`` (7 inch) or width and height (inch).
+        dpi
+            Dots per inch of a png.
 
         Returns
         -------
@@ -142,22 +179,69 @@ class Solution(AnimationMixin, SimulationResult):
         Raises
         ------
         InputError
-            For an unknown kind, option, joint, loop, point or suffix; if the run has not what is
-            to be drawn; for balance and reactions of a loaded run that had a controller.
+            For an unknown kind, joint, loop, point or suffix, or an option that the kind does not
+            have; if the run has not what is to be drawn; for balance and reactions of a loaded run
+            that had a controller.
         ControllerError, EvaluationError
             If forces cannot be evaluated again.
         OSError
             If the file cannot be written.
         """
+        given = locals()  # every other parameter is an option
+        for name in ("self", "path", "kind"):
+            del given[name]
         from srm_mbs.visualization.plotting import plot_solution
 
-        return plot_solution(self, path, kind, **options)
+        return plot_solution(self, path, kind, given)
 
-    def report(self, path: str | Path, **options: Any) -> None:
-        """Write one page about the run; see :func:`srm_mbs.analysis.report.report.write_report`."""
+    def report(
+        self,
+        path: str | Path,
+        *,
+        animation: bool = True,
+        pictures: Sequence[str] | None = None,
+        certificate: Certificate | None = None,
+        rtol: float | None = None,
+        again: bool = True,
+        progress: Any = False,
+        full_paths: bool = False,
+    ) -> None:
+        """Write one page about the run; see :func:`srm_mbs.analysis.report.report.write_report`.
+
+        Parameters
+        ----------
+        path
+            Name of the file, usually ``.html``; an existing one is replaced.
+        animation
+            Whether to include the animation, which is most of the file.
+        pictures
+            Kinds of :meth:`plot` among ``run``, ``state``, ``balance``, ``reactions`` and
+            ``sigma``; by default all.
+        certificate
+            From :func:`srm_mbs.certify` of this run; by default it is computed with ``rtol``,
+            ``again`` and ``progress``, which are those of that function.
+        full_paths
+            Whether the page names the folders of the mechanism's files.
+
+        Raises
+        ------
+        InputError
+            If ``rtol`` or a kind of plot is not valid, or the animation or the file cannot be
+            written.
+        """
         from srm_mbs.analysis.report.report import write_report
 
-        write_report(self, path, **options)
+        write_report(
+            self,
+            path,
+            animation=animation,
+            pictures=pictures,
+            certificate=certificate,
+            rtol=rtol,
+            again=again,
+            progress=progress,
+            full_paths=full_paths,
+        )
 
 
 class SegmentedSolution(SegmentedResult, Solution):
@@ -178,7 +262,15 @@ class SegmentedSolution(SegmentedResult, Solution):
 class DaeSolution(DaeResult):
     """Result of :func:`solve_dae`: states and multipliers, pictures, tables."""
 
-    def plot(self, path: str | Path | None = None, kind: str = "run", **options: Any) -> Figure:
+    def plot(
+        self,
+        path: str | Path | None = None,
+        kind: str = "run",
+        *,
+        title: str | None = None,
+        size: str | tuple[float, float] | None = None,
+        dpi: float | None = None,
+    ) -> Figure:
         """A picture of the run.
 
         Parameters
@@ -188,20 +280,23 @@ class DaeSolution(DaeResult):
             omitted.
         kind
             ``run``: drift, sigma and step sizes.  ``state``: states and multipliers.
-        **options
-            ``title``: the title; ``size``: ``"column"`` (3.5 inch wide), ``"page"`` (7 inch) or
-            width and height (inch); ``dpi``: dots per inch of a png.
+        title
+            The title.
+        size
+            ``"column"`` (3.5 inch wide), ``"page"`` (7 inch) or width and height (inch).
+        dpi
+            Dots per inch of a png.
 
         Raises
         ------
         InputError
-            For an unknown kind, option or suffix.
+            For an unknown kind or suffix, or an option that is not valid.
         OSError
             If the file cannot be written.
         """
         from srm_mbs.visualization.plotting import plot_dae
 
-        return plot_dae(self, path, kind, **options)
+        return plot_dae(self, path, kind, {"title": title, "size": size, "dpi": dpi})
 
 
 SOLUTIONS = ResultTypes(Solution, SegmentedSolution)

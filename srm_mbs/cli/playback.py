@@ -139,10 +139,10 @@ def overlay_options(
         If a trace is malformed, its point does not exist or does not move, or no closure has
         reactions.
     """
-    from srm_mbs.visualization.animation.overlays import OverlayOptions
+    from srm_mbs.visualization.animation.overlays import ViewOptions
 
     anchors = given_points(trace or [], "--trace")
-    OverlayOptions(anchors, gaps, reactions).check(mechanism)
+    ViewOptions(anchors, gaps, reactions).check(mechanism)
     return {"trace": anchors, "gaps": gaps, "reactions": reactions}
 
 

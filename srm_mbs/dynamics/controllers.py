@@ -66,7 +66,7 @@ def evaluate_controller(
     name = "the controller"
     given = _output(name, controller, t, q, v)
     if isinstance(given, Mapping):
-        return _forces_of_joints(given, mechanism, t)
+        return forces_of_joints(given, mechanism, t, "the controller's force")
     result = _converted(name, given, t)
     problem = _problem(result, len(v))
     if problem is None:
@@ -78,11 +78,22 @@ def evaluate_controller(
     )
 
 
-def _forces_of_joints(given: Mapping[Any, Any], mechanism: MechanismData, t: float) -> FloatArray:
-    """The mapping {joint: force} as generalised forces (nv,)."""
+def forces_of_joints(
+    given: Mapping[Any, Any], mechanism: MechanismData, t: float, what: str
+) -> FloatArray:
+    """The mapping {joint: force} as generalised forces (nv,), N and N m, at ``t`` (s).
+
+    The force is a number for a joint of one degree of freedom and an array (joint.nv,) for the
+    others; joints that are not named have none.  Messages call a force ``what``.
+
+    Raises
+    ------
+    ControllerError
+        For a joint that is not known, or a force that is not finite or has another shape.
+    """
     tau = np.zeros(mechanism.model.nv)
     for name, force in given.items():
-        own_name = f"the controller's force of the joint {safe_repr(name)}"
+        own_name = f"{what} of the joint {safe_repr(name)}"
         try:
             joint = mechanism.joint(name)
         except InputError as error:

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.controllers import HeldForce
+from srm_mbs.dynamics.controllers import HeldForce, forces_of_joints
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.system import onto_closures
-from srm_mbs.errors import EvaluationError, InputError, SimulationError, safe_repr
+from srm_mbs.errors import (
+    ControllerError,
+    EvaluationError,
+    InputError,
+    SimulationError,
+    safe_repr,
+)
 from srm_mbs.integration.breakpoints import smooth_intervals
 from srm_mbs.integration.kernel.backend import uses_kernel
 from srm_mbs.integration.methods.base import Method
@@ -143,9 +150,10 @@ class Simulator:
         dt
             Positive; need not be the same every time.  One that is within rounding of ``t`` moves
             the time only.
-        tau : (nv,)
+        tau : (nv,) or {joint: force}
             Generalised forces held during the step, N and N m, beside those of the mechanism;
-            none by default.
+            none by default.  A mapping is that of a controller: joints that it does not name have
+            none.
 
         Returns
         -------
@@ -205,6 +213,15 @@ class Simulator:
         return state[: self._nq], state[self._nq :]
 
     def _force(self, tau: Any) -> FloatArray:
+        if isinstance(tau, Mapping):
+            try:
+                return forces_of_joints(tau, self._mechanism, self.t, "the force")
+            except ControllerError as error:
+                raise InputError(
+                    str(error),
+                    element="tau",
+                    remedy="Give finite forces of joints by their names, N and N m",
+                ) from error
         try:
             force = np.array(tau, dtype=float)  # the caller may change it afterwards
         except (TypeError, ValueError) as error:
@@ -333,5 +350,5 @@ def _bad_force(tau: Any) -> InputError:
     return InputError(
         f"tau = {safe_repr(tau)} is not a vector of finite generalised forces",
         element="tau",
-        remedy="Give nv numbers, N and N m",
+        remedy="Give nv numbers or {joint: force}, N and N m",
     )

@@ -229,6 +229,21 @@ def test_a_failed_step_raises_and_leaves_the_last_good_state(
 
 
 @on_both
+def test_forces_may_be_named_by_their_joints(backend: str) -> None:
+    ring = floating_ring()
+    joint = ring.joint("b")
+    tau = np.zeros(ring.model.nv)
+    tau[joint.idx_v : joint.idx_v + joint.nv] = 1.0, -0.5, 0.2
+    simulators = [srm.Simulator(ring, backend=backend) for _ in range(3)]
+    for simulator, force in zip(simulators, (tau, {"b": [1.0, -0.5, 0.2]}, {}), strict=True):
+        for _ in range(3):
+            simulator.step(0.05, force)
+    by_number, by_name, none = (np.append(s.q, s.v) for s in simulators)
+    assert np.array_equal(by_number, by_name)
+    assert np.abs(none - by_name).max() > 1e-3
+
+
+@on_both
 def test_bad_steps_and_times_are_refused(slider_crank: srm.Mechanism, backend: str) -> None:
     simulator = srm.Simulator(slider_crank, backend=backend)
     simulator.step(0.1)
@@ -237,7 +252,7 @@ def test_bad_steps_and_times_are_refused(slider_crank: srm.Mechanism, backend: s
         t = simulator.t
         for dt in (0.0, np.nan, "soon", None):
             messages[f"dt = {dt} {start}"] = refused(lambda: simulator.step(dt))  # noqa: B023
-        for tau in ([1.0], [np.nan, 0.0], "x"):
+        for tau in ([1.0], [np.nan, 0.0], "x", {"shaft": 1.0}, {"crank": [1.0, 2.0]}):
             refusal = refused(lambda: simulator.step(0.1, tau))  # noqa: B023
             messages[f"tau = {tau} {start}"] = refusal
         assert simulator.t == t

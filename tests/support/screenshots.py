@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 import srm_mbs as srm
+from srm_mbs.visualization.animation.overlays import ViewOptions
 from srm_mbs.visualization.animation.video import BARE, browser, photographer
 
 FOLDER = Path(__file__).parents[1] / "data" / "screenshots"
@@ -72,11 +73,11 @@ SHOTS = {
 def taken(shot: Shot, chromium: Any) -> bytes:
     """The PNG of a shot."""
     solution = shot.run()
-    drawn = dict.fromkeys(shot.drawn, True)
+    view = ViewOptions(**dict.fromkeys(shot.drawn, True))
     # Fonts differ from machine to machine.
     style = f"{BARE} #panel {{ display: none; }}"
     t = shot.time(solution)
-    with photographer(solution, SIZE, 60.0, drawn, [t], chromium, style) as photograph:
+    with photographer(solution, SIZE, 60.0, view, [t], chromium, style) as photograph:
         return photograph(t)
 
 

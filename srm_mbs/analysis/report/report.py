@@ -25,7 +25,7 @@ from srm_mbs.errors import InputError, __version__, safe_repr
 from srm_mbs.formats.files import checked_path, utf8
 from srm_mbs.model.numbers import flag, name_list
 from srm_mbs.simulation.result import SimulationResult
-from srm_mbs.visualization.animation.overlays import OverlayOptions
+from srm_mbs.visualization.animation.overlays import ViewOptions
 from srm_mbs.visualization.animation.page import render, write_file
 from srm_mbs.visualization.animation.playback import page_of
 
@@ -48,7 +48,7 @@ def write_report(
     path: str | Path,
     *,
     animation: bool = True,
-    pictures: Sequence[str] = tuple(PICTURES),
+    pictures: Sequence[str] | None = None,
     certificate: Certificate | None = None,
     rtol: float | None = None,
     again: bool = True,
@@ -67,7 +67,8 @@ def write_report(
         Whether to include the animation, which is most of the file; a snapshot is always included.
     pictures
         Kinds of plots (:meth:`srm_mbs.Solution.plot`) among ``run``, ``state``, ``balance``,
-        ``reactions`` and ``sigma``; a sentence replaces one that this run does not have.
+        ``reactions`` and ``sigma``, by default all; a sentence replaces one that this run does not
+        have.
     certificate
         From :func:`srm_mbs.certify` of this run; by default it is computed with ``rtol``, ``again``
         and ``progress``.
@@ -85,7 +86,7 @@ def write_report(
     file = checked_path(path)
     flag(animation, "animation")
     flag(full_paths, "full_paths")
-    pictures = name_list(pictures, "pictures")
+    pictures = name_list(PICTURES if pictures is None else pictures, "pictures")
     for kind in pictures:
         if kind not in PICTURES:
             raise InputError(
@@ -112,7 +113,7 @@ def report_page(
     """The page of :func:`write_report`."""
     player = None
     if animation:
-        player = page_of(solution, FRAMES_PER_SECOND, OverlayOptions(), panel=True)
+        player = page_of(solution, FRAMES_PER_SECOND, ViewOptions(), panel=True)
     included = {"animation": animation, "pictures": bool(pictures)}
     return render(
         FOLDER,

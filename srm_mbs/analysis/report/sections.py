@@ -308,7 +308,7 @@ def pictures_data(
         if kind == "sigma" and not solution.crossings:
             continue  # the plot of kind "run" shows it
         try:
-            figure = plot_solution(solution, kind=kind)
+            figure = plot_solution(solution, None, kind, {})
         except InputError as error:
             problem = _about(solution.mechanism, error, full_paths)
             missing.append(f"{PICTURES[kind]} Not drawn: {problem}")

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,10 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.errors import InputError
 from srm_mbs.formats.files import checked_path
+from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.numbers import finite_array
+from srm_mbs.simulation.monitoring import Counted
+from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
 if TYPE_CHECKING:
     from srm_mbs.visualization.animation.playback import Embedded
@@ -28,39 +32,201 @@ class AnimationMixin:
     meshcat and the modules that draw with it are imported on first use.
     """
 
-    def play(self, **options: Any) -> None:
+    @property
+    def _drawable(self: Any) -> DrawableMotion:
+        """This motion itself: the classes with these methods are such motions."""
+        motion: DrawableMotion = self
+        return motion
+
+    def play(
+        self,
+        *,
+        fps: float = 60.0,
+        open_browser: bool = True,
+        block: bool | None = None,
+        trace: Sequence[Anchor] = (),
+        gaps: bool = False,
+        reactions: bool = False,
+    ) -> None:
         """Play the motion in the browser; see
-        :func:`srm_mbs.visualization.animation.playback.play`."""
+        :func:`srm_mbs.visualization.animation.playback.play`.
+
+        Parameters
+        ----------
+        fps
+            Key frames per second.
+        open_browser
+            Open a browser window; otherwise only serve the page.  Its address is logged.
+        block
+            Wait until Ctrl-C; by default in a script, and not in an interactive session.
+        trace
+            Points whose paths are drawn, for example ``[srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))]``.
+        gaps
+            Draw the gaps of the closures, exaggerated by a factor that the panel gives.
+        reactions
+            Colour the closures by the magnitude of their reaction force.
+
+        Raises
+        ------
+        InputError
+            If ``fps`` is not a positive number, an overlay cannot be drawn, or meshcat is missing
+            or cannot start.
+        """
+        from srm_mbs.visualization.animation.overlays import ViewOptions
         from srm_mbs.visualization.animation.playback import play
 
-        play(self, **options)  # type: ignore[arg-type]
+        view = ViewOptions(trace, gaps, reactions)
+        play(self._drawable, fps=fps, open_browser=open_browser, block=block, view=view)
 
-    def show(self, **options: Any) -> Embedded:
+    def show(
+        self,
+        *,
+        height: int = 420,
+        fps: float = 60.0,
+        trace: Sequence[Anchor] = (),
+        gaps: bool = False,
+        reactions: bool = False,
+        panel: bool = True,
+    ) -> Embedded:
         """The animation as the output of a notebook cell; see
-        :func:`srm_mbs.visualization.animation.playback.show_in_notebook`."""
+        :func:`srm_mbs.visualization.animation.playback.show_in_notebook`.
+
+        Parameters
+        ----------
+        height
+            Of the frame, pixels.
+        fps, trace, gaps, reactions, panel
+            As for :meth:`export_html`.
+
+        Raises
+        ------
+        InputError
+            If ``height`` is not a positive whole number, or as for :meth:`export_html`.
+        """
+        from srm_mbs.visualization.animation.overlays import ViewOptions
         from srm_mbs.visualization.animation.playback import show_in_notebook
 
-        return show_in_notebook(self, **options)  # type: ignore[arg-type]
+        view = ViewOptions(trace, gaps, reactions)
+        return show_in_notebook(self._drawable, height=height, fps=fps, view=view, panel=panel)
 
-    def export_html(self, path: str | Path, **options: Any) -> None:
+    def export_html(
+        self,
+        path: str | Path,
+        *,
+        fps: float = 60.0,
+        trace: Sequence[Anchor] = (),
+        gaps: bool = False,
+        reactions: bool = False,
+        panel: bool = True,
+    ) -> None:
         """Write a self-contained page with the animation; see
-        :func:`srm_mbs.visualization.animation.playback.export_html`."""
+        :func:`srm_mbs.visualization.animation.playback.export_html`.
+
+        Parameters
+        ----------
+        path
+            Name of the file, usually ``.html``; an existing one is replaced.
+        fps, trace, gaps, reactions
+            As for :meth:`play`.
+        panel
+            Whether the page has the panel and the marks of singular passages.
+
+        Raises
+        ------
+        InputError
+            If ``fps`` is not a positive number, an overlay cannot be drawn, meshcat is missing, or
+            the file cannot be written.
+        """
+        from srm_mbs.visualization.animation.overlays import ViewOptions
         from srm_mbs.visualization.animation.playback import export_html
 
-        export_html(self, checked_path(path), **options)  # type: ignore[arg-type]
+        view = ViewOptions(trace, gaps, reactions)
+        export_html(self._drawable, checked_path(path), fps=fps, view=view, panel=panel)
 
-    def export_image(self, path: str | Path, **options: Any) -> None:
+    def export_image(
+        self,
+        path: str | Path,
+        *,
+        t: float | None = None,
+        size: str | tuple[float, float] = (900, 600),
+        dpi: float | None = None,
+        trace: Sequence[Anchor] = (),
+        gaps: bool = False,
+        reactions: bool = False,
+    ) -> None:
         """Write a picture at one time; see
-        :func:`srm_mbs.visualization.animation.video.export_image`."""
+        :func:`srm_mbs.visualization.animation.video.export_image`.
+
+        Parameters
+        ----------
+        path
+            Name of the ``.png``; an existing one is replaced.
+        t
+            Time (s) in the run; its end by default.
+        size
+            Width and height in pixels, of which ratios other than 3 to 2 have margins; with ``dpi``
+            in inches.  ``"column"`` (3.5 inch wide) and
+            ``"page"`` (7 inch) are two thirds as high as wide.
+        dpi
+            Dots per inch, for print; 300 with a name of a size.
+        trace, gaps, reactions
+            As for :meth:`play`.
+
+        Raises
+        ------
+        InputError
+            If ``t`` lies outside the run, ``path`` is no ``.png`` or cannot be written, an overlay
+            cannot be drawn, or Chromium or playwright is missing.
+        """
+        from srm_mbs.visualization.animation.overlays import ViewOptions
         from srm_mbs.visualization.animation.video import export_image
 
-        export_image(self, path, **options)  # type: ignore[arg-type]
+        view = ViewOptions(trace, gaps, reactions)
+        export_image(self._drawable, path, t=t, size=size, dpi=dpi, view=view)
 
-    def export_video(self, path: str | Path, **options: Any) -> None:
-        """Write a video; see :func:`srm_mbs.visualization.animation.video.export_video`."""
+    def export_video(
+        self,
+        path: str | Path,
+        *,
+        fps: float = 25.0,
+        speed: float = 1.0,
+        size: tuple[int, int] = (720, 480),
+        progress: bool | Counted = False,
+        trace: Sequence[Anchor] = (),
+        gaps: bool = False,
+        reactions: bool = False,
+    ) -> None:
+        """Write a video; see :func:`srm_mbs.visualization.animation.video.export_video`.
+
+        Parameters
+        ----------
+        path
+            Name of the ``.gif`` or ``.mp4``; without a suffix a folder for numbered pictures.
+        fps
+            Frames per second of video.
+        speed
+            Seconds of the run per second of video.
+        size
+            Width and height in pixels.
+        progress
+            True for a progress bar, or a callable (done, total).
+        trace, gaps, reactions
+            As for :meth:`play`.
+
+        Raises
+        ------
+        InputError
+            If ``path`` has another suffix, is a folder that is not empty, or cannot be written, a
+            number is not positive, an overlay cannot be drawn, or Chromium, playwright or ffmpeg is
+            missing.
+        """
+        from srm_mbs.visualization.animation.overlays import ViewOptions
         from srm_mbs.visualization.animation.video import export_video
 
-        export_video(self, path, **options)  # type: ignore[arg-type]
+        view = ViewOptions(trace, gaps, reactions)
+        export_video(
+            self._drawable, path, fps=fps, speed=speed, size=size, progress=progress, view=view
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -17,9 +17,10 @@ from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError, get_logger
+from srm_mbs.model.anchors import Anchor
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 from srm_mbs.visualization.animation.meshcat_scene import draw_picture, node_names
-from srm_mbs.visualization.animation.overlays import OverlayOptions, Overlays
+from srm_mbs.visualization.animation.overlays import Overlays, ViewOptions
 from srm_mbs.visualization.animation.page import (
     DRIFT,
     ENERGY,
@@ -89,7 +90,7 @@ class LiveView:
 
     def __init__(self, mechanism: Mechanism, *, open_browser: bool = True) -> None:
         start = JointMotion(mechanism, np.zeros(1), np.array(mechanism.q0)[None])
-        picture = make_picture(start, 1.0, OverlayOptions())
+        picture = make_picture(start, 1.0, ViewOptions())
         view = replace(picture.view, distance=CAMERA_MARGIN * picture.view.distance)
         picture = replace(picture, view=view, overlays=Overlays())
         data = page_data(start, picture)
@@ -167,23 +168,29 @@ class LiveView:
             self._node.set_transform(np.hstack([head, *places]))
         self.shown += 1
 
-    def play(self, solution: DrawableMotion, **drawn: Any) -> None:
+    def play(
+        self,
+        solution: DrawableMotion,
+        *,
+        trace: Sequence[Anchor] = (),
+        gaps: bool = False,
+        reactions: bool = False,
+    ) -> None:
         """Play the run in the same page.
 
         Parameters
         ----------
         solution
             The run.
-        drawn
-            ``trace``, ``gaps`` and ``reactions`` of
-            :func:`srm_mbs.visualization.animation.playback.play`.
+        trace, gaps, reactions
+            The overlays, as for :meth:`srm_mbs.Solution.play`.
 
         Raises
         ------
         InputError
             If the server does not answer, or has stopped, or an overlay cannot be drawn.
         """
-        picture = make_picture(solution, 60.0, OverlayOptions(**drawn))
+        picture = make_picture(solution, 60.0, ViewOptions(trace, gaps, reactions))
         data = page_data(solution, picture)
         with self.visualizer.window.answering(REPLY_TIME, SERVER_GONE_REMEDY):
             self.visualizer["/about"].set_property("about", json.dumps(data, allow_nan=False))

@@ -62,17 +62,20 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
-class OverlayOptions:
-    """Overlays that are requested beside springs.
+class ViewOptions:
+    """The overlays of an animation, image or video: those that are requested beside springs.
+
+    The methods that show a motion (:class:`srm_mbs.JointMotion`) take them by these names, as does
+    the command line.
 
     Parameters
     ----------
     trace
-        Points whose paths are drawn.
+        Points whose paths are drawn, for example ``[srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))]``.
     gaps
-        Draw the gaps of the closures, exaggerated.
+        Draw the gaps of the closures, exaggerated by a factor that the panel gives.
     reactions
-        Colour the closures by the magnitude of their reaction force.
+        Colour the closures by the magnitude of their reaction force, with a legend in the panel.
     """
 
     trace: Sequence[Anchor] = ()
@@ -106,6 +109,10 @@ class OverlayOptions:
             If one is no anchor, does not exist, or lies on the ground.
         """
         return resolve_moving(mechanism.model, self.trace, "trace")
+
+
+NO_OVERLAYS = ViewOptions()
+"""Springs only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +178,7 @@ def active_springs(
     )
 
 
-def overlay_joints(motion: DrawableMotion, options: OverlayOptions) -> set[int]:
+def overlay_joints(motion: DrawableMotion, options: ViewOptions) -> set[int]:
     """Indices of the joints whose motion :func:`make_overlays` reads."""
     model = motion.mechanism.model
     anchors = options.anchors(motion.mechanism)
@@ -184,7 +191,7 @@ def overlay_joints(motion: DrawableMotion, options: OverlayOptions) -> set[int]:
 
 
 def make_overlays(
-    motion: DrawableMotion, options: OverlayOptions, bodies: BodyMotion, extent: float
+    motion: DrawableMotion, options: ViewOptions, bodies: BodyMotion, extent: float
 ) -> Overlays:
     """Springs, and the requested overlays, at the key frames of ``bodies``.
 

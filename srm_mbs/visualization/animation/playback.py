@@ -11,15 +11,14 @@ import math
 import sys
 import time
 import webbrowser
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from srm_mbs.errors import InputError, get_logger, safe_repr
-from srm_mbs.model.anchors import Anchor
 from srm_mbs.visualization.animation.meshcat_scene import draw_picture, import_meshcat
-from srm_mbs.visualization.animation.overlays import OverlayOptions
+from srm_mbs.visualization.animation.overlays import NO_OVERLAYS, ViewOptions
 from srm_mbs.visualization.animation.page import (
     FOLDER,
     make_page,
@@ -69,9 +68,7 @@ def play(
     fps: float = 60.0,
     open_browser: bool = True,
     block: bool | None = None,
-    trace: Sequence[Anchor] = (),
-    gaps: bool = False,
-    reactions: bool = False,
+    view: ViewOptions = NO_OVERLAYS,
 ) -> Any:
     """Play a run in the browser, in real time and repeatedly.
 
@@ -82,7 +79,7 @@ def play(
     ----------
     solution
         The run, or a prescribed motion; a run that failed is played up to its end.
-    fps, trace, gaps, reactions
+    fps, view
         As for :func:`export_html`.
     open_browser
         Open a browser window; otherwise only serve the page.  Its address is logged.
@@ -101,7 +98,7 @@ def play(
         If ``fps`` is not a positive number, an overlay cannot be drawn, or meshcat is missing or
         cannot start.
     """
-    picture = make_picture(solution, check_fps(fps), OverlayOptions(trace, gaps, reactions))
+    picture = make_picture(solution, check_fps(fps), view)
     page = make_page(solution.mechanism.name, page_data(solution, picture), None)
     visualizer = serve(page, picture)
     show(visualizer, solution.mechanism.name, open_browser=open_browser)
@@ -195,9 +192,7 @@ def export_html(
     path: str | Path,
     *,
     fps: float = 60.0,
-    trace: Sequence[Anchor] = (),
-    gaps: bool = False,
-    reactions: bool = False,
+    view: ViewOptions = NO_OVERLAYS,
     panel: bool = True,
 ) -> None:
     """Write one file that plays a run in any browser, without a network or a server.
@@ -219,12 +214,8 @@ def export_html(
         and fewer above :data:`srm_mbs.visualization.animation.trajectory.MAX_BODY_FRAMES` key
         frames of all bodies together, to keep the file below 5 MB unless there are mesh files or
         very many bodies, or the run takes the better part of an hour.
-    trace
-        Points whose paths are drawn, for example ``[srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))]``.
-    gaps
-        Draw the gaps of the closures, exaggerated by a factor that the panel gives.
-    reactions
-        Colour the closures by the magnitude of their reaction force, with a legend in the panel.
+    view
+        The overlays.
     panel
         Whether the page has the panel and the marks.
 
@@ -234,20 +225,20 @@ def export_html(
         If ``fps`` is not a positive number, an overlay cannot be drawn, meshcat is missing, or the
         file cannot be written.
     """
-    page = page_of(solution, fps, OverlayOptions(trace, gaps, reactions), panel=panel)
+    page = page_of(solution, fps, view, panel=panel)
     write_file(Path(path), page.encode())
 
 
 def page_of(
     solution: DrawableMotion,
     fps: float,
-    options: OverlayOptions,
+    view: ViewOptions,
     *,
     panel: bool,
     extra: Iterable[float] = (),
 ) -> str:
     """The page of :func:`export_html`, with key frames at ``extra`` times (s); errors as there."""
-    picture = make_picture(solution, check_fps(fps), options, extra)
+    picture = make_picture(solution, check_fps(fps), view, extra)
     recorder = _Recorder()
     draw_picture(import_meshcat().Visualizer(window=recorder), picture)
     data = page_data(solution, picture, panel=panel)
@@ -281,9 +272,7 @@ def show_in_notebook(
     *,
     height: int = 420,
     fps: float = 60.0,
-    trace: Sequence[Anchor] = (),
-    gaps: bool = False,
-    reactions: bool = False,
+    view: ViewOptions = NO_OVERLAYS,
     panel: bool = True,
 ) -> Embedded:
     """The animation of a run as the value of a notebook cell.
@@ -294,7 +283,7 @@ def show_in_notebook(
         The run, or a prescribed motion.
     height
         Of the frame, pixels.
-    fps, trace, gaps, reactions, panel
+    fps, view, panel
         Those of :func:`srm_mbs.visualization.animation.playback.export_html`.
 
     Raises
@@ -309,5 +298,5 @@ def show_in_notebook(
             element="height",
             remedy="Give for example height=420",
         )
-    page = page_of(solution, fps, OverlayOptions(trace, gaps, reactions), panel=panel)
+    page = page_of(solution, fps, view, panel=panel)
     return Embedded(page, height)

@@ -14,8 +14,8 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.visualization.animation.overlays import (
-    OverlayOptions,
     Overlays,
+    ViewOptions,
     active_springs,
     make_overlays,
     overlay_joints,
@@ -131,7 +131,7 @@ class Picture:
 
 
 def make_picture(
-    motion: DrawableMotion, fps: float, options: OverlayOptions, extra: Iterable[float] = ()
+    motion: DrawableMotion, fps: float, options: ViewOptions, extra: Iterable[float] = ()
 ) -> Picture:
     """Key frames of everything that is drawn of ``motion``.
 

@@ -21,7 +21,7 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.simulation.result import SimulationResult
-from srm_mbs.visualization.animation.overlays import OverlayOptions
+from srm_mbs.visualization.animation.overlays import ViewOptions
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, View, choose_view, make_picture
 from srm_mbs.visualization.animation.shapes import Box, Colour, Cylinder, Mesh, Shape
 from srm_mbs.visualization.animation.trajectory import active_at
@@ -62,7 +62,7 @@ def draw_snapshot(solution: SimulationResult, t: float) -> bytes:
 
     start, end = solution.span
     fps = VIEW_FRAMES / (end - start) if end > start else 1.0
-    picture = make_picture(solution, fps, OverlayOptions(), [t])
+    picture = make_picture(solution, fps, ViewOptions(), [t])
     motion, view = picture.motion, picture.view
     frame = int(np.abs(motion.times - t).argmin())
     triangles, colours = [np.zeros((0, 3, 3))], [np.zeros((0, 3))]

@@ -25,15 +25,13 @@ from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, safe_repr
 from srm_mbs.formats.files import whole_file
 from srm_mbs.simulation.monitoring import Counted, counting
 from srm_mbs.simulation.options import check_progress
-from srm_mbs.visualization.animation.overlays import OverlayOptions
+from srm_mbs.visualization.animation.overlays import ViewOptions
 from srm_mbs.visualization.animation.page import write_file
 from srm_mbs.visualization.animation.playback import check_fps, page_of
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
 log = get_logger(__name__)
 
-SIZE = (900, 600)
-"""Width and height of an image in pixels; ratios other than 3 to 2 have margins."""
 PRINT_RESOLUTION = 300.0
 """Dots per inch of an image whose size is given by a name."""
 LARGEST_SIDE = 8192
@@ -189,7 +187,7 @@ def photographer(
     solution: DrawableMotion,
     size: tuple[int, int],
     fps: float,
-    drawn: dict[str, Any],
+    view: ViewOptions,
     times: Sequence[float],
     chromium: Any = None,
     style: str = BARE,
@@ -204,9 +202,8 @@ def photographer(
         Width and height in pixels.
     fps
         Key frames per second, between which the browser interpolates linearly.
-    drawn
-        ``trace``, ``gaps`` and ``reactions`` of
-        :func:`srm_mbs.visualization.animation.playback.export_html`.
+    view
+        The overlays.
     times
         Times (s) of the pictures, which get key frames of their own.
     chromium
@@ -229,8 +226,7 @@ def photographer(
     own = browser() if chromium is None else nullcontext(chromium)
     with private_folder() as folder, own as opened:
         file = folder / "page.html"
-        options = OverlayOptions(**drawn)
-        file.write_bytes(page_of(solution, fps, options, panel=False, extra=times).encode())
+        file.write_bytes(page_of(solution, fps, view, panel=False, extra=times).encode())
         page = opened.new_page(viewport={"width": width, "height": height})
         page.goto(file.as_uri())
         page.wait_for_function("viewer.scene_tree.children.mechanism !== undefined")
@@ -251,10 +247,10 @@ def export_image(
     solution: DrawableMotion,
     path: str | Path,
     *,
-    t: float | None = None,
-    size: str | tuple[float, float] = SIZE,
-    dpi: float | None = None,
-    **drawn: Any,
+    t: float | None,
+    size: str | tuple[float, float],
+    dpi: float | None,
+    view: ViewOptions,
 ) -> None:
     """Write an image of a run at one time.
 
@@ -265,15 +261,14 @@ def export_image(
     path
         Name of the ``.png``; an existing one is replaced.
     t
-        Time (s) in the run; its end by default.
+        Time (s) in the run; None for its end.
     size
         Width and height in pixels; with ``dpi`` in inches.  ``"column"`` (3.5 inch wide) and
         ``"page"`` (7 inch) are two thirds as high as wide.
     dpi
         Dots per inch, for print; 300 with a name of a size.
-    drawn
-        ``trace``, ``gaps`` and ``reactions`` of
-        :func:`srm_mbs.visualization.animation.playback.export_html`.
+    view
+        The overlays.
 
     Raises
     ------
@@ -298,7 +293,7 @@ def export_image(
     density: float | None = None
     if dpi is not None or isinstance(size, str):
         pixels, density = _print(size, dpi)
-    with photographer(solution, pixels, 60.0, drawn, [t]) as photograph:
+    with photographer(solution, pixels, 60.0, view, [t]) as photograph:
         picture = photograph(t)
     write_file(path, picture if density is None else _with_density(picture, density))
 
@@ -344,11 +339,11 @@ def export_video(
     solution: DrawableMotion,
     path: str | Path,
     *,
-    fps: float = 25.0,
-    speed: float = 1.0,
-    size: tuple[int, int] = (720, 480),
-    progress: bool | Counted = False,
-    **drawn: Any,
+    fps: float,
+    speed: float,
+    size: tuple[int, int],
+    progress: bool | Counted,
+    view: ViewOptions,
 ) -> None:
     """Write a video of a run, or its pictures into a folder.
 
@@ -369,9 +364,8 @@ def export_video(
     progress
         True for a progress bar (on a terminal only), or a callable (done, total) that is called
         after each picture.
-    drawn
-        ``trace``, ``gaps`` and ``reactions`` of
-        :func:`srm_mbs.visualization.animation.playback.export_html`.
+    view
+        The overlays.
 
     Raises
     ------
@@ -402,7 +396,7 @@ def export_video(
     start, end = solution.span
     count = max(1, math.floor((end - start) / speed * fps * (1.0 + 1e-12)) + 1)
     times = np.minimum(start + np.arange(count) * (speed / fps), end).tolist()
-    with photographer(solution, size, fps / min(speed, 1.0), drawn, times) as photograph:
+    with photographer(solution, size, fps / min(speed, 1.0), view, times) as photograph:
         taken = _photographs(photograph, times, progress)
         if not kind:
             _write_frames(path, taken)

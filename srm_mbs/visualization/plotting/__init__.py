@@ -91,17 +91,22 @@ def check_options(kind: str, options: Iterable[str] = (), kinds: Kinds = KINDS) 
 
 
 def plot_solution(
-    solution: SimulationResult, path: str | Path | None = None, kind: str = "run", **options: Any
+    solution: SimulationResult, path: str | Path | None, kind: str, options: Mapping[str, Any]
 ) -> Figure:
-    """Plot a run; see :meth:`srm_mbs.Solution.plot`."""
-    return _plot(KINDS, solution, path, kind, **options)
+    """Plot a run; see :meth:`srm_mbs.Solution.plot`, whose keywords are ``options``."""
+    return _plot(KINDS, solution, path, kind, **given_options(options))
 
 
 def plot_dae(
-    solution: DaeResult, path: str | Path | None = None, kind: str = "run", **options: Any
+    solution: DaeResult, path: str | Path | None, kind: str, options: Mapping[str, Any]
 ) -> Figure:
-    """Plot a run of a DAE; see :meth:`srm_mbs.DaeSolution.plot`."""
-    return _plot(DAE_KINDS, solution, path, kind, **options)
+    """Plot a run of a DAE; see :meth:`srm_mbs.DaeSolution.plot`, whose keywords are ``options``."""
+    return _plot(DAE_KINDS, solution, path, kind, **given_options(options))
+
+
+def given_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of ``options`` that differ from their defaults, None and False."""
+    return {name: value for name, value in options.items() if not (value is None or value is False)}
 
 
 def _plot(

@@ -18,7 +18,7 @@ from PIL import Image
 import srm_mbs as srm
 from srm_mbs.analysis.report.report import report_page
 from srm_mbs.analysis.report.sections import pictures_data, run_data
-from srm_mbs.visualization.animation.overlays import OverlayOptions
+from srm_mbs.visualization.animation.overlays import ViewOptions
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, make_picture
 from srm_mbs.visualization.animation.shapes import ANCHOR_COLOUR
 from srm_mbs.visualization.animation.snapshot import draw_snapshot
@@ -380,7 +380,7 @@ def test_the_bob_stands_in_the_snapshot_where_kinematics_puts_it(t: float) -> No
     _, columns = np.nonzero(coloured(seen(run, t), (0.902, 0.624, 0.0)))
     angle = run(t)[0][0]
     bob = np.array([math.cos(angle), 0.0, math.sin(angle)])
-    view = make_picture(run, 200.0, OverlayOptions()).view
+    view = make_picture(run, 200.0, ViewOptions()).view
     right, _, forward = view.axes @ (bob - view.target)
     scale = 300.0 / math.tan(math.radians(0.5 * FIELD_OF_VIEW))
     assert 0.5 * (columns.min() + columns.max() + 1) == pytest.approx(

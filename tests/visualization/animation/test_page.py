@@ -21,7 +21,7 @@ import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.visualization.animation import overlays
 from srm_mbs.visualization.animation.overlays import (
-    OverlayOptions,
+    ViewOptions,
     gaps_of,
     ramp_colours,
     turns_along,
@@ -433,16 +433,16 @@ def test_the_bar_is_as_long_as_it_says_and_the_axes_are_those_of_the_world(page:
         "['x', 'y', 'z'].map(n => [element(`axis-${n}`).x2.baseVal.value - 28,"
         " 28 - element(`axis-${n}`).y2.baseVal.value])"
     )
-    view = make_picture(srm.simulate(load("slider_crank"), 0.1), 20.0, OverlayOptions()).view
+    view = make_picture(srm.simulate(load("slider_crank"), 0.1), 20.0, ViewOptions()).view
     np.testing.assert_allclose(np.array(ends), 18.0 * view.axes[:2].T, atol=0.1)
 
 
 def test_without_gravity_there_is_no_ground() -> None:
     floating = srm.simulate(floating_ring(), 0.1)
-    data = page_data(floating, make_picture(floating, 20.0, OverlayOptions()))
+    data = page_data(floating, make_picture(floating, 20.0, ViewOptions()))
     assert data["ground"] is None
     assert (
-        page_data(floating, make_picture(floating, 20.0, OverlayOptions()), panel=False)["bodies"]
+        page_data(floating, make_picture(floating, 20.0, ViewOptions()), panel=False)["bodies"]
         == []
     )
 
@@ -800,7 +800,7 @@ def test_animations_that_cannot_be_made_are_refused(
 
 def test_the_camera_sees_the_whole_path_of_a_point_far_out(slider_crank: srm.Solution) -> None:
     far = srm.Anchor("rod", xyz=(9.0, 0.0, 0.0))
-    view = make_picture(slider_crank, 20.0, OverlayOptions([far])).view
+    view = make_picture(slider_crank, 20.0, ViewOptions([far])).view
     path = np.array([place(slider_crank, t, far) for t in np.linspace(0.0, 8.0, 161)])
     x, y, depth = view.axes @ (path - view.target).T
     slope = np.tan(np.radians(0.5 * FIELD_OF_VIEW)) * (view.distance + depth)
@@ -818,7 +818,7 @@ def flight() -> srm.Solution:
 
 
 def test_the_picture_goes_along_with_a_mechanism_that_travels_far(flight: srm.Solution) -> None:
-    picture = make_picture(flight, 30.0, OverlayOptions())
+    picture = make_picture(flight, 30.0, ViewOptions())
     assert picture.along is not None
     assert picture.along[0] == pytest.approx(0.0, abs=1e-12)
     assert 150.0 < np.linalg.norm(picture.along[-1]) < 210.0
@@ -832,7 +832,7 @@ def test_a_free_mechanism_that_travels_about_its_own_size_is_followed_from_the_s
     v = np.array(ring.v0)
     v[:3] += [4.0, 0.0, 0.0]
     slow = srm.simulate(ring, 1.0, v0=v)
-    picture = make_picture(slow, 30.0, OverlayOptions())
+    picture = make_picture(slow, 30.0, ViewOptions())
     assert picture.along is not None
     np.testing.assert_allclose(picture.along[0], 0.0, atol=1e-12)
     assert 2.0 < np.linalg.norm(picture.along[-1]) < 6.0
@@ -852,8 +852,8 @@ def test_the_snapshot_of_a_mechanism_that_travels_far_shows_it_at_any_time(
 def test_the_picture_stands_still_where_a_joint_holds_to_the_ground_or_little_is_gained(
     slider_crank: srm.Solution,
 ) -> None:
-    assert make_picture(slider_crank, 30.0, OverlayOptions()).along is None
-    assert make_picture(srm.simulate(floating_ring(), 1.0), 30.0, OverlayOptions()).along is None
+    assert make_picture(slider_crank, 30.0, ViewOptions()).along is None
+    assert make_picture(srm.simulate(floating_ring(), 1.0), 30.0, ViewOptions()).along is None
 
 
 @pytest.mark.browser

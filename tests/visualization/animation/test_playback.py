@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 import logging
 import subprocess
 from collections.abc import Iterator
@@ -14,6 +16,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.visualization.animation import scene, trajectory
+from srm_mbs.visualization.animation.overlays import ViewOptions
 from srm_mbs.visualization.animation.playback import close, export_html, play
 from srm_mbs.visualization.animation.scene import choose_view
 from srm_mbs.visualization.animation.shapes import (
@@ -615,3 +618,17 @@ def test_play_serves_a_page_that_repeats_the_motion_in_real_time(browser: Any) -
             assert found == {"world", *solution.mechanism.joint_names}
     finally:
         close(visualizer)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        *(getattr(srm.JointMotion, name) for name in ("play", "show", "export_html")),
+        *(srm.JointMotion.export_image, srm.JointMotion.export_video, srm.LiveView.play),
+    ],
+)
+def test_every_method_that_shows_a_motion_names_all_overlays(method: Any) -> None:
+    parameters = inspect.signature(method).parameters
+    assert all(given.kind is not given.VAR_KEYWORD for given in parameters.values())
+    for overlay in dataclasses.fields(ViewOptions):
+        assert parameters[overlay.name].default == overlay.default

@@ -22,7 +22,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.visualization.animation import video as rendering
-from srm_mbs.visualization.animation.overlays import OverlayOptions
+from srm_mbs.visualization.animation.overlays import ViewOptions
 from srm_mbs.visualization.animation.scene import FIELD_OF_VIEW, make_picture
 from tests.support.commands import run as run_command
 from tests.support.commands import run_apart
@@ -74,7 +74,7 @@ def picture_of(solution: srm.Solution, path: Path, **options: Any) -> Any:
 
 def seen_at(solution: srm.Solution, place: Any, fps: float, size: tuple[int, int]) -> np.ndarray:
     """Column and row of a point (3,) m in a picture of ``size``."""
-    view = make_picture(solution, fps, OverlayOptions()).view
+    view = make_picture(solution, fps, ViewOptions()).view
     x, y, depth = view.axes @ (np.asarray(place) - view.target)
     half = 0.5 * np.array(size)
     scale = half[1] / math.tan(math.radians(0.5 * FIELD_OF_VIEW)) / (view.distance + depth)

@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 from srm_mbs.visualization.animation import scene
-from srm_mbs.visualization.animation.overlays import OverlayOptions
+from srm_mbs.visualization.animation.overlays import ViewOptions
 from srm_mbs.visualization.animation.shapes import Visual, visuals_of
 from tests.support.screenshots import FOLDER, SHOTS, SIZE, Shot, differences, pixels, taken
 
@@ -57,7 +57,7 @@ def test_pictures_of_different_times_and_mechanisms_are_unlike() -> None:
 
 def drawn_with(monkeypatch: pytest.MonkeyPatch, browser: Any, shot: Shot, change: Any) -> Any:
     """The picture with changed visuals, from the same place."""
-    view = scene.make_picture(shot.run(), 60.0, OverlayOptions()).view
+    view = scene.make_picture(shot.run(), 60.0, ViewOptions()).view
     monkeypatch.setattr(scene, "choose_view", lambda mechanism, points: view)
     monkeypatch.setattr(scene, "visuals_of", lambda *given: change(visuals_of(*given)))
     return seen(shot, browser)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import warnings
 from functools import partial
@@ -18,7 +19,7 @@ from PIL import Image
 import srm_mbs as srm
 from srm_mbs.api import Solution
 from srm_mbs.visualization.joint_components import rotation_vectors
-from srm_mbs.visualization.plotting import KINDS, joints, sampling
+from srm_mbs.visualization.plotting import COMMON, DAE_KINDS, KINDS, joints, sampling
 from srm_mbs.visualization.plotting import figure as style
 from srm_mbs.visualization.plotting.poses import plane_normal
 from tests.support.bundled import load
@@ -129,7 +130,6 @@ def test_plots_that_cannot_be_drawn_are_refused(
     cases: dict[str, tuple[Any, dict[str, Any]]] = {
         "an unknown kind": (slider_crank, {"kind": "drift"}),
         "joints of a run plot": (slider_crank, {"kind": "run", "joints": ["crank"]}),
-        "an unknown option": (slider_crank, {"kind": "state", "joint": ["crank"]}),
         "an unknown joint": (slider_crank, {"kind": "state", "joints": ["krank"]}),
         "one name": (slider_crank, {"kind": "state", "joints": "crank"}),
         "no names": (slider_crank, {"kind": "state", "joints": []}),
@@ -931,3 +931,20 @@ def test_runaway_states_are_drawn_without_warnings() -> None:
         figure = solution.plot(kind=kind)
         if kind in ("run", "reactions"):  # those with logarithms and peaks; drawing is slow
             figure.draw_without_rendering()
+
+
+@pytest.mark.parametrize(("result", "kinds"), [(Solution, KINDS), (srm.DaeSolution, DAE_KINDS)])
+def test_the_signature_of_plot_names_the_options_of_all_kinds(result: Any, kinds: Any) -> None:
+    named = [list(inspect.signature(draw).parameters)[1:] for draw in kinds.values()]
+    every = {*COMMON, *(name for names in named for name in names)}
+    _, path, kind, *options = inspect.signature(result.plot).parameters.values()
+    assert (path.name, kind.name) == ("path", "kind")
+    assert {option.name for option in options} == every
+    assert all(option.kind is inspect.Parameter.KEYWORD_ONLY for option in options)
+    # The defaults are those that are not handed on.
+    assert all(option.default in (None, False) for option in options)
+
+
+def test_options_at_their_defaults_are_those_of_no_kind(slider_crank: Solution) -> None:
+    figure = slider_crank.plot(kind="run", joints=None, rows=False, accelerations=False)
+    assert titles(figure) == titles(slider_crank.plot())

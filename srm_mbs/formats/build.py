@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.assembly.assemble import assemble
+from srm_mbs.assembly.assemble import consistent_start
 from srm_mbs.assembly.implied_rows import without_implied_rows
 from srm_mbs.assembly.position import CONSTRAINT_TOLERANCE, limit_springs
 from srm_mbs.dynamics.mechanism import Mechanism
@@ -376,12 +375,7 @@ def _advice(error: AssemblyError) -> str:
 
 def _closed(mechanism: Mechanism, q: dict[str, Any], v: dict[str, Any]) -> Mechanism:
     """The mechanism in the state that assembly finds, analysed there."""
-    # Assembly analyses this copy where its loops are closed, at rest.
-    guess = copy(mechanism)
-    state = assemble(guess, q, v)
-    if np.array_equal(state.v, guess.v0):
-        mechanism = guess
-    mechanism = mechanism.with_state(state.q, state.v)
+    mechanism = consistent_start(mechanism, q, v).mechanism
     _ = mechanism.structure
     return mechanism
 

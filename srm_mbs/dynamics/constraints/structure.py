@@ -9,6 +9,7 @@ Source: docs/notation.md, "Load-time analysis" and "Manifold sampling".
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -17,6 +18,7 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
+from srm_mbs.dynamics.constraints.compiled_rows import ClosureRows
 from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.constraints.projection import (
     PIVOT_ZERO,
@@ -97,11 +99,14 @@ class ManifoldSampler:
         self.data = workspace(self.model)
         self.units = units
         self.row_unit = row_units(mechanism, units)
-        self._rows = DrivenKinematics(self.model, mechanism.loops, mechanism.drives)
+        rows = DrivenKinematics(self.model, mechanism.loops, mechanism.drives)
+        self._rows = ClosureRows(self.model, rows)
         self.closed = len(self.row_unit)
-        self.scale = np.ones(len(self._rows.g))
+        # From G to rows over their unit, of coordinates over theirs.
+        self._to_units = units.coordinate / self.row_unit[:, None]
+        self.scale = np.ones(len(rows.g))
         self.eliminations: tuple[Elimination, ...] = ()
-        pattern = self._pattern = self._rows.pattern()
+        pattern = self._pattern = rows.pattern()
         closures = [loop for loop in mechanism.loops for _ in loop.row_names]
         self._anchored = [row for row, loop in enumerate(closures) if not loop.rows.joint_rows]
         # All rows and those of the loops in the mass metric, those of the loops in units.
@@ -112,19 +117,16 @@ class ManifoldSampler:
         self._trees = trees(self.model)
         self._factorised: FloatArray | None = None
 
-    def _evaluate(self, q: FloatArray) -> None:
-        """g and G of all rows, and M in ``data``, at q."""
-        self._rows.evaluate(self.model, self.data, q)
-        self._factorised = None
-
     def _scaled(self, q: FloatArray) -> FloatArray:
-        """G (rows, nv) of the rows after the eliminations, over their scale."""
-        self._evaluate(q)
-        G = self._rows.G.copy()
+        """G (rows, nv) of the rows after the eliminations, over their scale; M at q in ``data``."""
+        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
+        self._rows.evaluate(q)
+        G = self._rows.G
+        if self.eliminations:
+            G = G.copy()
         for row, other, factor in self.eliminations:
             G[row] -= factor * G[other]
-        G /= self.scale[:, None]
-        return G
+        return G / self.scale[:, None]
 
     def factorised(self, q: FloatArray) -> tuple[RowAlgebra, RowAlgebra]:
         """The algebra of all scaled rows, and that of the loops', in the mass metric at q."""
@@ -141,20 +143,20 @@ class ManifoldSampler:
         largest error left, in row units."""
         if not self.closed:
             return q, 0.0
-        unit, own = self.units.coordinate, slice(self.closed)
+        against, own = -self.units.coordinate, slice(self.closed)
 
         def linearise(q: FloatArray) -> tuple[float, Callable[[], FloatArray | None]]:
-            self._evaluate(q)
+            self._rows.evaluate(q)
             g = self._rows.g[own] / self.row_unit
 
             def step() -> FloatArray | None:
-                by_unit = self._rows.G[own] / self.row_unit[:, None] * unit
+                by_unit = self._rows.G[own] * self._to_units
                 try:
-                    longest = np.sqrt((by_unit * by_unit).sum(axis=1).max())
+                    longest = math.sqrt(np.einsum("ij,ij->i", by_unit, by_unit).max())
                     self._in_units.factor(None, by_unit, CLOSING_RANK * longest)
                 except EvaluationError:
                     return None
-                return pin.integrate(self.model, q, -self._in_units.solve(g) * unit)  # type: ignore[no-any-return]
+                return pin.integrate(self.model, q, self._in_units.solve(g) * against)  # type: ignore[no-any-return]
 
             return float(np.abs(g).max()), step
 

@@ -138,6 +138,107 @@ def _check_distances(problem: ClosureProblem, start: FloatArray) -> None:
         ) from error
 
 
+@dataclass(frozen=True, eq=False)
+class ConsistentStart:
+    """A mechanism in a consistent state, not analysed yet unless its assembly needed that.
+
+    Attributes
+    ----------
+    mechanism
+        The mechanism in this state.
+    problem
+        Its closure equations; None without closures and drives.
+    at_rest
+        The mechanism in this configuration with the rates that it had before, which is analysed
+        where it is singular; ``mechanism`` itself if these are the consistent ones.
+    """
+
+    mechanism: Mechanism
+    problem: ClosureProblem | None
+    at_rest: Mechanism
+
+
+def consistent_start(
+    mechanism: Mechanism,
+    q: Mapping[str, Any] | Any = None,
+    v: Mapping[str, Any] | Any = None,
+    *,
+    guess: Mapping[str, Any] | None = None,
+    hold: Iterable[str] | None = None,
+    limits: bool = False,
+) -> ConsistentStart:
+    """The consistent state that :func:`assemble` finds, with the same parameters and errors."""
+    check_mechanism(mechanism)
+    flag(limits, "limits")
+    model = mechanism.model
+    start = np.array(mechanism.q0)
+    for name, value in named_values(guess, "guess").items():
+        if isinstance(q, Mapping) and name in q:
+            raise InputError(
+                f"joint {name!r} is held in q and guessed in guess",
+                element="guess",
+                remedy="Keep one of the two",
+            )
+        with naming(element="guess"):
+            set_position(mechanism, start, name, value)
+    held: tuple[str, ...] = ()
+    if isinstance(q, Mapping):
+        for name, value in q.items():
+            with naming(element="q"):
+                set_position(mechanism, start, name, value)
+        held = tuple(q)
+    elif q is not None:
+        start = pin.normalize(model, np.array(finite_numbers(q, model.nq, "q", ARRAY_OR_MAPPING)))
+        if not (np.isfinite(start).all() and pin.isNormalized(model, start, 1e-9)):
+            raise InputError(
+                "q has a quaternion, or a (cos, sin) pair, of length zero",
+                element="q",
+                remedy="Use pinocchio.normalize(model, q)",
+            )
+    if hold is not None:
+        held = name_list(hold, "hold")
+        for name in held:
+            with naming(element="hold"):
+                mechanism.joint(name)
+    rates = np.zeros(model.nv)
+    held_rates: tuple[str, ...] = ()
+    if isinstance(v, Mapping):
+        for name, value in v.items():
+            with naming(element="v"):
+                set_rate(mechanism, rates, name, value)
+        held_rates = tuple(v)
+    elif v is not None:
+        rates = np.array(finite_numbers(v, model.nv, "v", ARRAY_OR_MAPPING))
+    if not mechanism.constrained:
+        open_start = mechanism.with_state(start, rates)
+        return ConsistentStart(open_start, None, open_start)
+    held, to_close = _with_absolute_drives(mechanism, start, held)
+    problem = ClosureProblem(to_close, start)
+    closed = start.copy()
+    if to_close.loops:
+        _check_distances(problem, start)
+        closed = _positions(to_close, problem, start, held, limits)
+    if to_close is not mechanism:
+        problem = ClosureProblem(mechanism, start)
+    for name in held:  # moving a quaternion by nothing rounds it
+        joint = mechanism.joint(name)
+        own = slice(joint.idx_q, joint.idx_q + joint.nq)
+        closed[own] = start[own]
+    # Walks from open loops find few closed configurations: analyses begin here.
+    at_rest = mechanism.with_state(closed, mechanism.v0)
+    consistent = assemble_velocity(mechanism, problem, closed, rates, held_rates, at_rest)
+    same = np.array_equal(consistent, at_rest.v0)
+    found = at_rest if same else mechanism.with_state(closed, consistent)
+    residuals, _ = found.initial_errors
+    log.debug(
+        "%s: assembled with %s held, closed to %.1e",
+        mechanism.name,
+        ", ".join(held) or "no joint",
+        np.abs(residuals).max(initial=0.0),
+    )
+    return ConsistentStart(found, problem, at_rest)
+
+
 def assemble(
     mechanism: Mechanism,
     q: Mapping[str, Any] | Any = None,
@@ -187,81 +288,22 @@ def assemble(
         For unknown joints or malformed values, or a guess in which the points of a ``distance``
         coincide.
     """
-    check_mechanism(mechanism)
-    flag(limits, "limits")
-    model = mechanism.model
-    start = np.array(mechanism.q0)
-    for name, value in named_values(guess, "guess").items():
-        if isinstance(q, Mapping) and name in q:
-            raise InputError(
-                f"joint {name!r} is held in q and guessed in guess",
-                element="guess",
-                remedy="Keep one of the two",
-            )
-        with naming(element="guess"):
-            set_position(mechanism, start, name, value)
-    held: tuple[str, ...] = ()
-    if isinstance(q, Mapping):
-        for name, value in q.items():
-            with naming(element="q"):
-                set_position(mechanism, start, name, value)
-        held = tuple(q)
-    elif q is not None:
-        start = pin.normalize(model, np.array(finite_numbers(q, model.nq, "q", ARRAY_OR_MAPPING)))
-        if not (np.isfinite(start).all() and pin.isNormalized(model, start, 1e-9)):
-            raise InputError(
-                "q has a quaternion, or a (cos, sin) pair, of length zero",
-                element="q",
-                remedy="Use pinocchio.normalize(model, q)",
-            )
-    if hold is not None:
-        held = name_list(hold, "hold")
-        for name in held:
-            with naming(element="hold"):
-                mechanism.joint(name)
-    rates = np.zeros(model.nv)
-    held_rates: tuple[str, ...] = ()
-    if isinstance(v, Mapping):
-        for name, value in v.items():
-            with naming(element="v"):
-                set_rate(mechanism, rates, name, value)
-        held_rates = tuple(v)
-    elif v is not None:
-        rates = np.array(finite_numbers(v, model.nv, "v", ARRAY_OR_MAPPING))
-    if not mechanism.constrained:
-        return Assembly(start, rates, np.zeros(0), np.zeros(0), np.eye(model.nv), False)
-    held, to_close = _with_absolute_drives(mechanism, start, held)
-    problem = ClosureProblem(to_close, start)
-    closed = start.copy()
-    if to_close.loops:
-        _check_distances(problem, start)
-        closed = _positions(to_close, problem, start, held, limits)
-    if to_close is not mechanism:
-        problem = ClosureProblem(mechanism, start)
-    for name in held:  # moving a quaternion by nothing rounds it
-        joint = mechanism.joint(name)
-        own = slice(joint.idx_q, joint.idx_q + joint.nq)
-        closed[own] = start[own]
-    # Walks from open loops find few closed configurations: the analysis is made here.
-    analysed = mechanism.with_state(closed, mechanism.v0)
-    consistent = assemble_velocity(mechanism, problem, closed, rates, held_rates, analysed)
-    drives = DriveRows(mechanism, problem, closed)
-    free = null_basis(np.concatenate([problem.normalised(closed), drives.rows]), SINGULAR)
+    start = consistent_start(mechanism, q, v, guess=guess, hold=hold, limits=limits)
+    found, problem = start.mechanism, start.problem
+    if problem is None:
+        nothing, everything = np.zeros(0), np.eye(mechanism.model.nv)
+        return Assembly(found.q0.copy(), found.v0.copy(), nothing, nothing, everything, False)
+    drives = DriveRows(mechanism, problem, found.q0)
+    free = null_basis(np.concatenate([problem.normalised(found.q0), drives.rows]), SINGULAR)
     if structure_of.kept(mechanism) is None:
-        structure_of.keep(mechanism, analysed.structure.at(mechanism))
-    residuals, rate_residuals = mechanism.with_state(closed, consistent).initial_errors
-    log.debug(
-        "%s: assembled with %s held, closed to %.1e, %d directions free",
-        mechanism.name,
-        ", ".join(held) or "no joint",
-        np.abs(residuals).max(initial=0.0),
-        free.shape[1],
-    )
+        structure_of.keep(mechanism, start.at_rest.structure.at(mechanism))
+    residuals, rate_residuals = found.initial_errors
+    log.debug("%s: %d directions are free", mechanism.name, free.shape[1])
     return Assembly(
-        closed,
-        consistent,
+        found.q0.copy(),
+        found.v0.copy(),
         residuals,
         rate_residuals,
         problem.unit[:, None] * free,
-        free.shape[1] > analysed.degrees_of_freedom,
+        free.shape[1] > start.at_rest.degrees_of_freedom,
     )

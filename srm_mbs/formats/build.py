@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,10 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.assembly.assemble import assemble
+from srm_mbs.assembly.assemble import consistent_start
 from srm_mbs.assembly.implied_rows import without_implied_rows
 from srm_mbs.assembly.position import CONSTRAINT_TOLERANCE, limit_springs
+from srm_mbs.dynamics.constraints.structure import ReusableAnalysis, structure_of
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import (
     AssemblyError,
@@ -186,6 +186,8 @@ class Reading:
         The class of the mechanism.
     variants
         Reads it again with other values of its parameters; None without parameters.
+    analysis
+        That of another variant of the description, if it is one.
     """
 
     description: Description
@@ -196,6 +198,7 @@ class Reading:
     check: Callable[[Mechanism], None] | None = None
     kind: type[Mechanism] = Mechanism
     variants: VariantMaker | None = None
+    analysis: ReusableAnalysis | None = None
 
 
 def unassembled(
@@ -374,14 +377,19 @@ def _advice(error: AssemblyError) -> str:
     )
 
 
-def _closed(mechanism: Mechanism, q: dict[str, Any], v: dict[str, Any]) -> Mechanism:
-    """The mechanism in the state that assembly finds, analysed there."""
-    # Assembly analyses this copy where its loops are closed, at rest.
-    guess = copy(mechanism)
-    state = assemble(guess, q, v)
-    if np.array_equal(state.v, guess.v0):
-        mechanism = guess
-    mechanism = mechanism.with_state(state.q, state.v)
+def _closed(
+    mechanism: Mechanism,
+    q: dict[str, Any],
+    v: dict[str, Any],
+    analysis: ReusableAnalysis | None,
+) -> Mechanism:
+    """The mechanism in the state that assembly finds, analysed there unless ``analysis``, that of
+    another variant, is valid for it."""
+    mechanism = consistent_start(mechanism, q, v).mechanism
+    if analysis is not None and structure_of.kept(mechanism) is None:
+        structure = analysis.for_variant(mechanism)
+        if structure is not None:
+            structure_of.keep(mechanism, structure)
     _ = mechanism.structure
     return mechanism
 
@@ -402,7 +410,7 @@ def assembled(reading: Reading) -> Mechanism:
             reduced, note = without_implied_rows(mechanism, description.closing_tolerance)
             if note:
                 mechanism = replace(reduced, notes=(*reduced.notes, note))
-        mechanism = _closed(mechanism, q, v)
+        mechanism = _closed(mechanism, q, v, reading.analysis)
     except AssemblyError as error:
         error.remedy += _advice(error)
         if description.lock:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from srm_mbs.dynamics.constraints.structure import ReusableAnalysis
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError, get_logger, naming, safe_repr
 from srm_mbs.formats.build import Reading, assembled
@@ -163,12 +164,17 @@ def _of_description(
 
 @dataclass(frozen=True, eq=False)
 class _Variants:
-    """A description with parameters, and the text of its model file if it names one."""
+    """A description with parameters, and the text of its model file if it names one.
+
+    ``analysis`` is that of the mechanism that was loaded first: all variants are compared with it,
+    so that they do not depend on the order in which they are made.
+    """
 
     own: Document
     overrides: Overrides
     reach: Reach
     model: str | None
+    analysis: ReusableAnalysis | None = None
 
     @property
     def definition(self) -> tuple[Any, ...]:
@@ -178,7 +184,10 @@ class _Variants:
         values = {**self.overrides.parameters, **given_parameters(parameters)}
         with naming(file=self.own.file):
             overrides = replace(self.overrides, parameters=values)
-            return _mechanism(_of_description(self.own, overrides, self.reach, self.model))
+            reading = _of_description(self.own, overrides, self.reach, self.model)
+            mechanism = assembled(replace(reading, analysis=self.analysis))
+        variant_maker.keep(mechanism, replace(self, overrides=overrides))
+        return mechanism
 
 
 def _of_tables(
@@ -219,7 +228,9 @@ def _mechanism(reading: Reading) -> Mechanism:
     """The assembled mechanism, which knows its variants."""
     with naming(file=reading.source.path):
         mechanism = assembled(reading)
-    variant_maker.keep(mechanism, reading.variants)
+    if isinstance(reading.variants, _Variants):
+        analysis = ReusableAnalysis.of(mechanism)
+        variant_maker.keep(mechanism, replace(reading.variants, analysis=analysis))
     return mechanism
 
 

@@ -11,8 +11,8 @@ of the elimination tree: along a chain of loops from one end to the other, in a 
 the leaves to the root.  Source: J. A. George, J. W. H. Liu, The evolution of the minimum degree
 ordering algorithm, SIAM Review 31 (1989) 1.
 
-*The factorisation* :class:`RowAlgebra`, by LAPACK, or for many coordinates by the kernel
-(``algebra.cpp``), whose sparse algebra follows the graph of the loops.
+*The factorisation* :class:`RowAlgebra`, by the kernel (``algebra.cpp``), whose sparse algebra
+follows the graph of many loops, or by LAPACK where there is no kernel.
 
 *Rank, null space, smallest singular value and minimum-norm solution* of A x = b.  With few
 coordinates they come from the singular values of A.  With many they come from the factorisation
@@ -48,8 +48,9 @@ from srm_mbs.errors import EvaluationError
 GRAPH_ORDER_ABOVE = 64
 """Coordinates above which pivots are taken along the graph of the loops."""
 
-KERNEL_ABOVE = 64
-"""Coordinates above which row algebra runs on the compiled kernel, where there is one."""
+KERNEL_ABOVE = 0
+"""Coordinates above which row algebra runs on the compiled kernel, where there is one: it takes a
+tenth of the time of calls of LAPACK where these are few."""
 
 SPARSE_ABOVE = 64
 """Columns above which singular values come from a sparse factorisation."""
@@ -305,8 +306,8 @@ class CompiledAlgebra:
 
 
 def row_algebra(pattern: BoolArray, model: pin.Model | None = None) -> RowAlgebra:
-    """The algebra of rows with entries where ``pattern`` (rows, nv) is true: by the kernel for
-    more than ``KERNEL_ABOVE`` coordinates, otherwise by LAPACK.
+    """The algebra of rows with entries where ``pattern`` (rows, nv) is true: by the kernel, or by
+    LAPACK without one or for at most ``KERNEL_ABOVE`` coordinates.
 
     Parameters
     ----------

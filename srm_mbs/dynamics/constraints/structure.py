@@ -9,14 +9,17 @@ Source: docs/notation.md, "Load-time analysis" and "Manifold sampling".
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
+from srm_mbs.dynamics.constraints.compiled_rows import ClosureRows
 from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.constraints.projection import (
     PIVOT_ZERO,
@@ -75,6 +78,12 @@ RANK_GAP = 1e3
 """Smallest ratio of the smallest structural to the largest redundant pivot without a warning."""
 
 
+CHECKED_STEPS = 6
+"""Closed configurations, beside the start, in which an analysis of a variant is checked."""
+SIMILAR = 4.0
+"""Largest ratio of the norms of rows, and of the last pivot, of two mechanisms with one analysis."""
+
+
 class ManifoldSampler:
     """Closes loops and walks on the closure manifold.
 
@@ -97,11 +106,14 @@ class ManifoldSampler:
         self.data = workspace(self.model)
         self.units = units
         self.row_unit = row_units(mechanism, units)
-        self._rows = DrivenKinematics(self.model, mechanism.loops, mechanism.drives)
+        rows = DrivenKinematics(self.model, mechanism.loops, mechanism.drives)
+        self._rows = ClosureRows(self.model, rows)
         self.closed = len(self.row_unit)
-        self.scale = np.ones(len(self._rows.g))
+        # From G to rows over their unit, of coordinates over theirs.
+        self._to_units = units.coordinate / self.row_unit[:, None]
+        self.scale = np.ones(len(rows.g))
         self.eliminations: tuple[Elimination, ...] = ()
-        pattern = self._pattern = self._rows.pattern()
+        pattern = self._pattern = rows.pattern()
         closures = [loop for loop in mechanism.loops for _ in loop.row_names]
         self._anchored = [row for row, loop in enumerate(closures) if not loop.rows.joint_rows]
         # All rows and those of the loops in the mass metric, those of the loops in units.
@@ -112,19 +124,16 @@ class ManifoldSampler:
         self._trees = trees(self.model)
         self._factorised: FloatArray | None = None
 
-    def _evaluate(self, q: FloatArray) -> None:
-        """g and G of all rows, and M in ``data``, at q."""
-        self._rows.evaluate(self.model, self.data, q)
-        self._factorised = None
-
     def _scaled(self, q: FloatArray) -> FloatArray:
-        """G (rows, nv) of the rows after the eliminations, over their scale."""
-        self._evaluate(q)
-        G = self._rows.G.copy()
+        """G (rows, nv) of the rows after the eliminations, over their scale; M at q in ``data``."""
+        pin.crba(self.model, self.data, q, pin.Convention.WORLD)
+        self._rows.evaluate(q)
+        G = self._rows.G
+        if self.eliminations:
+            G = G.copy()
         for row, other, factor in self.eliminations:
             G[row] -= factor * G[other]
-        G /= self.scale[:, None]
-        return G
+        return G / self.scale[:, None]
 
     def factorised(self, q: FloatArray) -> tuple[RowAlgebra, RowAlgebra]:
         """The algebra of all scaled rows, and that of the loops', in the mass metric at q."""
@@ -141,20 +150,20 @@ class ManifoldSampler:
         largest error left, in row units."""
         if not self.closed:
             return q, 0.0
-        unit, own = self.units.coordinate, slice(self.closed)
+        against, own = -self.units.coordinate, slice(self.closed)
 
         def linearise(q: FloatArray) -> tuple[float, Callable[[], FloatArray | None]]:
-            self._evaluate(q)
+            self._rows.evaluate(q)
             g = self._rows.g[own] / self.row_unit
 
             def step() -> FloatArray | None:
-                by_unit = self._rows.G[own] / self.row_unit[:, None] * unit
+                by_unit = self._rows.G[own] * self._to_units
                 try:
-                    longest = np.sqrt((by_unit * by_unit).sum(axis=1).max())
+                    longest = math.sqrt(np.einsum("ij,ij->i", by_unit, by_unit).max())
                     self._in_units.factor(None, by_unit, CLOSING_RANK * longest)
                 except EvaluationError:
                     return None
-                return pin.integrate(self.model, q, -self._in_units.solve(g) * unit)  # type: ignore[no-any-return]
+                return pin.integrate(self.model, q, self._in_units.solve(g) * against)  # type: ignore[no-any-return]
 
             return float(np.abs(g).max()), step
 
@@ -513,6 +522,90 @@ def analyse(mechanism: MechanismData) -> Structure:
         tuple(notes),
         sampler.eliminations,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class ReusableAnalysis:
+    """The analysis of a mechanism, with what a short walk from its start finds, for variants of it:
+    mechanisms of the same topology with other numbers.
+
+    Attributes
+    ----------
+    structure
+        The analysis.
+    lengths : (rows,)
+        Largest norm of each row, over its scale, on the walk.
+    last_pivot
+        Median of the last structural pivot.
+    """
+
+    structure: Structure
+    lengths: FloatArray
+    last_pivot: float
+
+    @classmethod
+    def of(cls, mechanism: MechanismData) -> ReusableAnalysis | None:
+        """That of ``mechanism``; None if its closures have no rank, or an uncertain one."""
+        structure = structure_of(mechanism)
+        walked = None if structure.notes else _walked(structure, mechanism)
+        if walked is None:
+            return None
+        return cls(structure, walked.largest, float(np.median(walked.last_pivots(structure.rank))))
+
+    def for_variant(self, mechanism: MechanismData) -> Structure | None:
+        """The analysis in the units of ``mechanism``, a variant; None where it is not valid.
+
+        It is valid if both have the same rows and, on the walk from the start of the variant, the
+        ranks of all rows and of those of the loops are those of the analysis, the same rows are
+        zero, and the norms of rows and the last pivot differ from those of the mechanism that was
+        analysed by the factor ``SIMILAR`` at most.  An analysis of the variant itself would then
+        differ in its scales alone, by about as much.
+
+        Raises
+        ------
+        EvaluationError
+            If the mass matrix is not positive definite where it is evaluated.
+        """
+        structure = self.structure
+        if structure.row_names != row_names(mechanism):
+            return None
+        walked = _walked(structure, mechanism)
+        if walked is None:
+            return None
+        used = structure.kept
+        ratios = walked.largest[used] / self.lengths[used]
+        ratios = np.append(ratios, np.median(walked.last_pivots(structure.rank)) / self.last_pivot)
+        if not (ratios.min() > 1.0 / SIMILAR and ratios.max() < SIMILAR):
+            return None
+        return structure.at(mechanism)
+
+
+def _walked(structure: Structure, mechanism: MechanismData) -> _Samples | None:
+    """A walk of ``CHECKED_STEPS`` from the start of ``mechanism``, with the row scales of
+    ``structure``; None if it contradicts the ranks and zero rows of that, or finds nothing."""
+    rank = structure.rank
+    sampler = ManifoldSampler(
+        mechanism, coordinate_units(mechanism, mechanism.q0, mechanism.v0)
+    )
+    sampler.scale, sampler.eliminations = structure.row_scale, structure.eliminations
+    start, error = sampler.close(mechanism.q0)
+    if not rank or not error < CLOSED:
+        return None
+    rng = np.random.default_rng(0)
+    walk = sampler.walk(start, rng, 1, CHECKED_STEPS, mechanism.v0)
+    samples = _sampled(sampler, chain([start], walk))
+    loops = int((samples.of_loops > STRUCTURAL_PIVOT).sum(axis=1).max())
+    if int(samples.ranks().max()) != rank or loops != structure.loop_rank:
+        return None
+    in_use = samples.largest > ZERO_ROW
+    in_use[sampler.closed :] = True
+    if not np.array_equal(in_use, structure.kept) or not samples.largest[in_use].all():
+        return None
+    if rank < samples.pivots.shape[1]:
+        redundant = max(float(samples.pivots[:, rank:].max()), PIVOT_ZERO)
+        if float(samples.last_pivots(rank).min()) < RANK_GAP * redundant:
+            return None
+    return samples
 
 
 @per_start

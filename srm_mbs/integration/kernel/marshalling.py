@@ -17,6 +17,7 @@ import numpy as np
 
 from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.compiled_rows import closure_structs
 from srm_mbs.dynamics.singularities import critical
 from srm_mbs.integration import (
     breakpoints,
@@ -441,12 +442,7 @@ def system_struct(constants: dict[str, Any]) -> Any:
     data = dict(constants)
     damping, friction = data.pop("damping"), data.pop("friction")
     return _core.SystemData(
-        closures=[_closure_rows(**rows) for rows in data.pop("loops")],
-        joint_rows=[_core.JointRow(**row) for row in data.pop("joint_rows")],
-        eliminations=[
-            _core.Elimination(row=row, other=other, factor=factor, columns=columns)
-            for row, other, factor, columns in data.pop("eliminations")
-        ],
+        **closure_structs({key: data.pop(key) for key in ("loops", "joint_rows", "eliminations")}),
         drives=[_driven_row(**row) for row in data.pop("drives")],
         forces=[force_struct(**force) for force in data.pop("forces")],
         groups=[
@@ -459,11 +455,6 @@ def system_struct(constants: dict[str, Any]) -> Any:
         friction=_NO_NUMBERS if friction is None else friction,
         **data,
     )
-
-
-def _closure_rows(support: FloatArray, **rows: Any) -> Any:
-    columns = np.flatnonzero(support)
-    return _core.ClosureRows(columns=columns.tolist(), signs=support[columns].astype(float), **rows)
 
 
 def _driven_row(curve: dict[str, Any], wound: bool, **row: Any) -> Any:

@@ -1,0 +1,113 @@
+"""Rows of closures, g and G, by the compiled kernel: for walks over many single configurations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._kernel import core
+from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rows import COINCIDENT, LoopKinematics
+
+_NO_NUMBERS = np.zeros(0)
+
+
+def closure_structs(constants: dict[str, Any]) -> dict[str, Any]:
+    """The fields of ``SystemData`` (system.hpp) that describe closures.
+
+    Parameters
+    ----------
+    constants
+        From :meth:`~srm_mbs.dynamics.constraints.rows.LoopKinematics.constants`.
+    """
+    made: Any = core
+    return {
+        "closures": [_closure_rows(**rows) for rows in constants["loops"]],
+        "joint_rows": [made.JointRow(**row) for row in constants["joint_rows"]],
+        "eliminations": [
+            made.Elimination(row=row, other=other, factor=factor, columns=columns)
+            for row, other, factor, columns in constants["eliminations"]
+        ],
+    }
+
+
+def _closure_rows(support: FloatArray, **rows: Any) -> Any:
+    made: Any = core
+    columns = np.flatnonzero(support)
+    return made.ClosureRows(columns=columns.tolist(), signs=support[columns].astype(float), **rows)
+
+
+class ClosureRows:
+    """g and G of closures at one configuration after the other, by the kernel where there is one.
+
+    Parameters
+    ----------
+    model, rows
+        The tree, and the rows of its closures, without motions of drives.
+
+    Attributes
+    ----------
+    g : (m,), G : (m, nv)
+        Closure errors and their Jacobian, after :meth:`evaluate`; they are not changed afterwards.
+    """
+
+    def __init__(self, model: pin.Model, rows: LoopKinematics) -> None:
+        self._model, self._rows, self._data = model, rows, workspace(model)
+        self.g, self.G = rows.g, rows.G
+        self._kernel: Any = None
+        if core is None:
+            return
+        count, nv = len(rows.g), int(model.nv)
+        fields: dict[str, Any] = {
+            "drives": [],
+            "forces": [],
+            "rows": count,
+            "structural_rank": 0,
+            "sigma_ref": 1.0,
+            "algebra": "auto",
+            "order": [],
+            "pivot_share": 0.0,
+            "pivot_window": 1,
+            "residual_scale": np.ones(count),
+            "unit": np.ones(nv),
+            "position_of": [-1] * nv,
+            "damping": _NO_NUMBERS,
+            "friction": _NO_NUMBERS,
+            "friction_speed": 1.0,
+            "coincident": COINCIDENT,
+            "half_turn": np.zeros(2),
+            "groups": [],
+            "series": _NO_NUMBERS,
+            "wrapped_angles": [],
+            "largest_rotation": 0.0,
+            "farthest_node": 0.0,
+            "rotation_per_step": 0.0,
+        }
+        data = core.SystemData(**fields, **closure_structs(LoopKinematics.constants(rows)))
+        self._kernel = core.System(model, data, None)
+        self._time = np.zeros(1)
+        self._state = np.zeros((1, model.nq + nv))
+        self._q = self._state[:, : model.nq]
+
+    def evaluate(self, q: FloatArray) -> None:
+        """Evaluate g and G at the configuration q (nq,).
+
+        Raises
+        ------
+        EvaluationError
+            If the points of a ``distance`` coincide.
+        """
+        if self._kernel is not None:
+            self._q[0] = q
+            try:
+                self.g = self._kernel.closure_errors(self._time, self._state)[0][0]
+                self.G = self._kernel.jacobians(self._time, q)[0]
+            except ArithmeticError:
+                pass  # the reference raises the error that says why
+            else:
+                return
+        self._rows.evaluate(self._model, self._data, q)
+        self.g, self.G = self._rows.g.copy(), self._rows.G.copy()

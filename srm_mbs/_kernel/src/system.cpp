@@ -570,11 +570,41 @@ void System::update_drives(double t, bool with_bias) {
     }
 }
 
+void System::use_code(const GeneratedTerms* code) {
+    if (code) {
+        std::size_t laws = 0;
+        for (const ForceElement& force : data_.forces) laws += force.curves.size();
+        code->check(nq, nv, data_.rows, static_cast<int>(laws));
+        law_values_.resize(laws);
+        columns_of_rows_.resize(data_.rows);
+    }
+    code_ = code;
+}
+
+// M, the forces f and the rows of the closures, by generated code.
+void System::generated_terms(double t, const double* state) {
+    auto& w = *work_;
+    std::size_t law = 0;
+    double s[3];
+    for (const ForceElement& force : data_.forces)
+        for (const Curve& curve : force.curves) {
+            curve.at(t, s);
+            law_values_[law++] = s[0];
+        }
+    for (int row = 0; row < data_.rows; ++row) columns_of_rows_[row] = column(row);
+    if (!code_->evaluate(state, state + nq, law_values_.data(), w.data.M.data(), w.data.nle.data(),
+                         f_.data(), g_.data(), bias_.data(), columns_of_rows_.data()))
+        throw EvaluationError{Failure::coincident};
+    for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
+}
+
 void System::tree_terms(const double* state) {
     auto& w = *work_;
     std::copy(state, state + nq, w.q.data());
     std::copy(state + nq, state + nq + nv, w.v.data());
-    if (closed_)
+    if (code_)
+        generated_terms(0.0, state);
+    else if (closed_)
         pinocchio_model::compute_terms(w);
     else
         pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
@@ -667,6 +697,14 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
         if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
         return;
     }
+    if (!closed_ && code_) {
+        generated_terms(t, state);
+        factorise_mass();
+        std::copy(f_.begin(), f_.end(), rate_.begin());
+        lu_solve(factors_.data(), nv, pivots_.data(), rate_.data());
+        if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
+        return;
+    }
     if (!closed_) {
         if (!data_.forces.empty()) {
             pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
@@ -680,14 +718,18 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
         if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
         return;
     }
-    pinocchio_model::compute_terms(w);
-    for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
-    if (joined)
-        joined_forces(t, state);
-    else if (!data_.forces.empty())
-        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
-                   laws);
-    update_closures(state, true);
+    if (code_ && !laws) {
+        generated_terms(t, state);
+    } else {
+        pinocchio_model::compute_terms(w);
+        for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
+        if (joined)
+            joined_forces(t, state);
+        else if (!data_.forces.empty())
+            add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
+                       laws);
+        update_closures(state, true);
+    }
     update_drives(t, true);
     Projection& p = *projection_;
     p.factor(w.data.M.data(), f_.data(), bias_.data(), zone.threshold);

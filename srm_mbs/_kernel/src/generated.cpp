@@ -1,0 +1,45 @@
+#include "generated.hpp"
+
+#include <dlfcn.h>
+
+#include <stdexcept>
+
+namespace srm {
+
+namespace {
+
+constexpr int interface_version = 1;  // ABI in integration/generated/terms.py
+
+// Places in srm_mbs_sizes.
+enum Size { version, coordinates, rates, rows_of, parameters_of, constants_of, laws_of };
+
+}  // namespace
+
+GeneratedTerms::GeneratedTerms(const std::string& path, const std::vector<double>& parameters) {
+    void* const handle = dlopen(path.c_str(), RTLD_NOW | RTLD_LOCAL);
+    if (!handle) throw std::invalid_argument(dlerror());
+    library_.reset(handle, dlclose);
+    const auto find = [&](const char* name) {
+        void* const found = dlsym(handle, name);
+        if (!found) throw std::invalid_argument(path + " has no " + name);
+        return found;
+    };
+    sizes_ = static_cast<const int*>(find("srm_mbs_sizes"));
+    if (sizes_[version] != interface_version)
+        throw std::invalid_argument(path + " has another interface");
+    if (static_cast<std::size_t>(sizes_[parameters_of]) != parameters.size())
+        throw std::invalid_argument(path + " has another number of parameters");
+    terms_ = reinterpret_cast<Terms*>(find("srm_mbs_terms"));
+    const auto prepare =
+        reinterpret_cast<void (*)(const double*, double*)>(find("srm_mbs_constants"));
+    constants_.resize(static_cast<std::size_t>(sizes_[constants_of]));
+    prepare(parameters.data(), constants_.data());
+}
+
+void GeneratedTerms::check(int nq, int nv, int rows, int laws) const {
+    if (sizes_[coordinates] != nq || sizes_[rates] != nv || sizes_[rows_of] != rows ||
+        sizes_[laws_of] != laws)
+        throw std::invalid_argument("the code was generated for a system of another size");
+}
+
+}  // namespace srm

@@ -1,0 +1,37 @@
+// Terms of one mechanism from code that was generated for it: integration/generated.
+#pragma once
+
+#include <memory>
+#include <string>
+#include <vector>
+
+namespace srm {
+
+// Constant after construction, so that threads may share it.
+class GeneratedTerms {
+public:
+    // Loads the library in `path`; the parameters are those of structure_of().  Throws
+    // std::invalid_argument where it cannot be loaded or was generated for another structure.
+    GeneratedTerms(const std::string& path, const std::vector<double>& parameters);
+
+    // At q (nq,), v (nv,) and with the values of the laws (laws,): M (nv, nv), its upper triangle
+    // column by column, nle (nv,), g and bias (rows,) and the entries of G by rows, as far as they
+    // may differ from zero.  Adds the forces of elements to tau (nv,).  False where two points
+    // coincide.
+    bool evaluate(const double* q, const double* v, const double* laws, double* M, double* nle,
+                  double* tau, double* g, double* bias, double* const* G) const {
+        return terms_(q, v, constants_.data(), laws, M, nle, tau, g, bias, G) == 0;
+    }
+    // Throws std::invalid_argument for a system of other sizes.
+    void check(int nq, int nv, int rows, int laws) const;
+
+private:
+    using Terms = int(const double*, const double*, const double*, const double*, double*, double*,
+                      double*, double*, double*, double* const*);
+    std::shared_ptr<void> library_;
+    Terms* terms_;
+    const int* sizes_;
+    std::vector<double> constants_;
+};
+
+}  // namespace srm

@@ -136,7 +136,7 @@ def simulate(
         float | None, option("H", "Fixed step (s) instead of step-size control.")
     ] = None,
     backend: Annotated[
-        str, option("auto|python|kernel", "Backend that computes the run.")
+        str, option("auto|python|kernel|generated", "Backend that computes the run.")
     ] = "auto",
     singular_tolerance: Annotated[
         float | None,

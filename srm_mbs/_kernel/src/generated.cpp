@@ -27,13 +27,21 @@ GeneratedTerms::GeneratedTerms(const std::string& path, const std::vector<double
     sizes_ = static_cast<const int*>(find("srm_mbs_sizes"));
     if (sizes_[version] != interface_version)
         throw std::invalid_argument(path + " has another interface");
-    if (static_cast<std::size_t>(sizes_[parameters_of]) != parameters.size())
-        throw std::invalid_argument(path + " has another number of parameters");
     terms_ = reinterpret_cast<Terms*>(find("srm_mbs_terms"));
-    const auto prepare =
-        reinterpret_cast<void (*)(const double*, double*)>(find("srm_mbs_constants"));
+    set_constants_ = reinterpret_cast<Constants*>(find("srm_mbs_constants"));
+    set_parameters(parameters);
+}
+
+GeneratedTerms::GeneratedTerms(const GeneratedTerms& other, const std::vector<double>& parameters)
+    : GeneratedTerms(other) {
+    set_parameters(parameters);
+}
+
+void GeneratedTerms::set_parameters(const std::vector<double>& parameters) {
+    if (static_cast<std::size_t>(sizes_[parameters_of]) != parameters.size())
+        throw std::invalid_argument("the generated code has another number of parameters");
     constants_.resize(static_cast<std::size_t>(sizes_[constants_of]));
-    prepare(parameters.data(), constants_.data());
+    set_constants_(parameters.data(), constants_.data());
 }
 
 void GeneratedTerms::check(int nq, int nv, int rows, int laws) const {

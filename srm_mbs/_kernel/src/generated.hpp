@@ -13,6 +13,8 @@ public:
     // Loads the library in `path`; the parameters are those of structure_of().  Throws
     // std::invalid_argument where it cannot be loaded or was generated for another structure.
     GeneratedTerms(const std::string& path, const std::vector<double>& parameters);
+    // The same code with other parameters.
+    GeneratedTerms(const GeneratedTerms& other, const std::vector<double>& parameters);
 
     // At q (nq,), v (nv,) and with the values of the laws (laws,): M (nv, nv), its upper triangle
     // column by column, nle (nv,), g and bias (rows,) and the entries of G by rows, as far as they
@@ -28,8 +30,12 @@ public:
 private:
     using Terms = int(const double*, const double*, const double*, const double*, double*, double*,
                       double*, double*, double*, double* const*);
+    using Constants = void(const double*, double*);
+    void set_parameters(const std::vector<double>& parameters);
+
     std::shared_ptr<void> library_;
     Terms* terms_;
+    Constants* set_constants_;
     const int* sizes_;
     std::vector<double> constants_;
 };

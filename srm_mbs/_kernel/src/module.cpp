@@ -267,7 +267,11 @@ void bind_system(nb::module_& m) {
              [](GeneratedTerms* self, const std::string& path, const Array& parameters) {
                  new (self) GeneratedTerms(path, to_vector(parameters));
              },
-             nb::arg("path"), nb::arg("parameters"));
+             nb::arg("path"), nb::arg("parameters"))
+        .def("with_parameters",
+             [](const GeneratedTerms& self, const Array& parameters) {
+                 return GeneratedTerms(self, to_vector(parameters));
+             });
     nb::class_<PySystem>(
         m, "System",
         nb::type_slots(collected<PySystem, &PySystem::model, &PySystem::controller,

@@ -16,7 +16,9 @@ from srm_mbs.integration.methods.psrm import PSRM
 
 log = get_logger(__name__)
 
-BACKENDS = ("auto", "python", "kernel")
+BACKENDS = ("auto", "python", "kernel", "generated")
+COMPILED = ("kernel", "generated")
+"""Those of which the compiled kernel makes the runs."""
 PLACEMENTS = ("automatic", "off")
 """Those that the kernel has."""
 
@@ -65,15 +67,17 @@ def unsupported_reason(method: Method, placement: str, singular_times: FloatArra
     return None
 
 
-def uses_kernel(asked: str, method: Method, placement: str, singular_times: FloatArray) -> bool:
-    """Whether a run with ``backend=asked`` is made by the compiled kernel.
+def chosen_backend(
+    asked: str, method: Method, placement: str, singular_times: FloatArray
+) -> str:
+    """The backend of a run with ``backend=asked``: ``"python"``, ``"kernel"``, or ``"generated"``.
 
     Warns, once per process, where the kernel would make the run if it were available.
 
     Raises
     ------
     InputError
-        If there is no such backend, or ``asked`` is the kernel and it cannot make the run.
+        If there is no such backend, or ``asked`` needs the kernel and it cannot make the run.
     """
     if not isinstance(asked, str) or asked not in BACKENDS:
         raise InputError(
@@ -82,9 +86,9 @@ def uses_kernel(asked: str, method: Method, placement: str, singular_times: Floa
             remedy=f"Known: {', '.join(BACKENDS)}",
         )
     if asked == "python" or (asked == "auto" and _unwanted()):
-        return False
+        return "python"
     lacking = unsupported_reason(method, placement, singular_times)
-    if asked == "kernel" and (lacking or core is None):
+    if asked in COMPILED and (lacking or core is None):
         other = "Use the backend auto, which takes the Python reference where it has to"
         raise InputError(
             f"the compiled kernel cannot make this run: {lacking or missing}",
@@ -95,7 +99,9 @@ def uses_kernel(asked: str, method: Method, placement: str, singular_times: Floa
         log.info("the Python reference makes this run, not the compiled kernel: %s", lacking)
     elif core is None:
         warn_missing()
-    return core is not None and not lacking
+    if core is None or lacking:
+        return "python"
+    return "kernel" if asked == "auto" else asked
 
 
 @cache

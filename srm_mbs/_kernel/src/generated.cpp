@@ -11,7 +11,7 @@ namespace {
 constexpr int interface_version = 1;  // ABI in integration/generated/terms.py
 
 // Places in srm_mbs_sizes.
-enum Size { version, coordinates, rates, rows_of, parameters_of, constants_of, laws_of };
+enum Size { version, coordinates, rates, rows_of, parameters_of, constants_of, laws_of, bodies_of };
 
 }  // namespace
 
@@ -44,9 +44,9 @@ void GeneratedTerms::set_parameters(const std::vector<double>& parameters) {
     set_constants_(parameters.data(), constants_.data());
 }
 
-void GeneratedTerms::check(int nq, int nv, int rows, int laws) const {
+void GeneratedTerms::check(int nq, int nv, int rows, int laws, int bodies) const {
     if (sizes_[coordinates] != nq || sizes_[rates] != nv || sizes_[rows_of] != rows ||
-        sizes_[laws_of] != laws)
+        sizes_[laws_of] != laws || sizes_[bodies_of] != bodies)
         throw std::invalid_argument("the code was generated for a system of another size");
 }
 

@@ -18,18 +18,20 @@ public:
 
     // At q (nq,), v (nv,) and with the values of the laws (laws,): M (nv, nv), its upper triangle
     // column by column, nle (nv,), g and bias (rows,) and the entries of G by rows, as far as they
-    // may differ from zero.  Adds the forces of elements to tau (nv,).  False where two points
-    // coincide.
+    // may differ from zero.  Adds the forces of elements but bushings to tau (nv,).  Of the bodies
+    // of bushings B has the rotation, column by column, the translation and the velocity (6,) in
+    // their axes, J (6, nv) the columns of the world Jacobian.  False where two points coincide.
     bool evaluate(const double* q, const double* v, const double* laws, double* M, double* nle,
-                  double* tau, double* g, double* bias, double* const* G) const {
-        return terms_(q, v, constants_.data(), laws, M, nle, tau, g, bias, G) == 0;
+                  double* tau, double* g, double* bias, double* const* G, double* const* B,
+                  double* J) const {
+        return terms_(q, v, constants_.data(), laws, M, nle, tau, g, bias, G, B, J) == 0;
     }
     // Throws std::invalid_argument for a system of other sizes.
-    void check(int nq, int nv, int rows, int laws) const;
+    void check(int nq, int nv, int rows, int laws, int bodies) const;
 
 private:
     using Terms = int(const double*, const double*, const double*, const double*, double*, double*,
-                      double*, double*, double*, double* const*);
+                      double*, double*, double*, double* const*, double* const*, double*);
     using Constants = void(const double*, double*);
     void set_parameters(const std::vector<double>& parameters);
 

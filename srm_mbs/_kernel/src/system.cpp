@@ -573,10 +573,26 @@ void System::update_drives(double t, bool with_bias) {
 void System::use_code(const GeneratedTerms* code) {
     if (code) {
         std::size_t laws = 0;
-        for (const ForceElement& force : data_.forces) laws += force.curves.size();
-        code->check(nq, nv, data_.rows, static_cast<int>(laws));
+        std::vector<int> joints;
+        bushing_elements_.clear();
+        for (const ForceElement& force : data_.forces) {
+            laws += force.curves.size();
+            if (force.kind != ForceKind::bushing) continue;
+            bushing_elements_.push_back(force);
+            for (const int joint : {force.a.joint, force.b.joint})
+                if (joint && std::find(joints.begin(), joints.end(), joint) == joints.end())
+                    joints.push_back(joint);
+        }
+        code->check(nq, nv, data_.rows, static_cast<int>(laws), static_cast<int>(joints.size()));
         law_values_.resize(laws);
         columns_of_rows_.resize(data_.rows);
+        bushing_bodies_.clear();
+        for (const int joint : joints) {
+            auto& at = work_->data.oMi[joint];
+            bushing_bodies_.push_back(at.rotation().data());
+            bushing_bodies_.push_back(at.translation().data());
+            bushing_bodies_.push_back(work_->data.v[joint].toVector().data());
+        }
     }
     code_ = code;
 }
@@ -593,8 +609,12 @@ void System::generated_terms(double t, const double* state) {
         }
     for (int row = 0; row < data_.rows; ++row) columns_of_rows_[row] = column(row);
     if (!code_->evaluate(state, state + nq, law_values_.data(), w.data.M.data(), w.data.nle.data(),
-                         f_.data(), g_.data(), bias_.data(), columns_of_rows_.data()))
+                         f_.data(), g_.data(), bias_.data(), columns_of_rows_.data(),
+                         bushing_bodies_.data(), w.data.J.data()))
         throw EvaluationError{Failure::coincident};
+    if (!bushing_elements_.empty())
+        add_forces(bushing_elements_, data_.coincident, w, t, state, v_.data(), bushings_,
+                   f_.data(), nullptr);
     for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
 }
 

@@ -293,6 +293,8 @@ private:
     const GeneratedTerms* code_ = nullptr;
     std::vector<double> law_values_;  // of the forces' curves, for generated code
     std::vector<double*> columns_of_rows_;
+    std::vector<ForceElement> bushing_elements_;  // and the memory of their kinematics
+    std::vector<double*> bushing_bodies_;
     ForceLaws laws_;
     // Elements with laws, and the others, where the laws are joined.
     std::vector<ForceElement> lawful_, lawless_;

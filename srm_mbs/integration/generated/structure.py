@@ -132,6 +132,9 @@ class Structure(NamedTuple):
         ZERO, ONE, MINUS_ONE or OTHER for each number of the vector of parameters.
     bodies
         Number of the motion that carries the body of each joint of the model; -1 for the ground.
+    bushing_joints, bushing_columns
+        Joints of the bodies between which bushings act, without the ground, and rates that move
+        them.
     """
 
     nq: int
@@ -146,6 +149,8 @@ class Structure(NamedTuple):
     coordinate_rows: tuple[CoordinateRow, ...]
     subtractions: tuple[Subtraction, ...]
     forces: tuple[Force, ...]
+    bushing_joints: tuple[int, ...]
+    bushing_columns: tuple[int, ...]
     codes: bytes
 
 
@@ -187,9 +192,9 @@ def _parts(kind: Mapping[str, Any], name: str, placement: Sequence[float]) -> li
     if own in _WHOLE:
         return [_Part(_WHOLE[own], (), (), placement)]
     if own in _UNALIGNED:
-        return [_Part(_UNALIGNED[own], kind["axes"][0], kind["numbers"], placement)]
+        return [_Part(_UNALIGNED[own], kind["axes"][0], kind.get("numbers", ()), placement)]
     if own[:-1] in _ALIGNED and own[-1] in _AXES:
-        return [_Part(_ALIGNED[own[:-1]], _AXES[own[-1]], kind["numbers"], placement)]
+        return [_Part(_ALIGNED[own[:-1]], _AXES[own[-1]], kind.get("numbers", ()), placement)]
     if own == "Universal":
         first, second = kind["axes"]
         return [
@@ -269,7 +274,8 @@ def _signs(support: FloatArray) -> tuple[tuple[int, int], ...]:
 
 
 BUSHING = 4
-"""The kind of bushings among those of forces.hpp."""
+"""The kind of bushings among those of forces.hpp: the kernel evaluates them, because their moments
+depend on the step."""
 _NO_ANCHOR = (0, np.array(_NO_PLACEMENT))
 
 
@@ -309,6 +315,12 @@ def structure_of(model: pin.Model, constants: Mapping[str, Any]) -> tuple[Struct
         ),
         "forces": _forces(numbers, constants["forces"]),
     }
+    bushings = [force for force in constants["forces"] if force["kind"] == BUSHING]
+    joints = [int(force[end][0]) for force in bushings for end in ("a", "b")]
+    columns = {int(j) for force in bushings for j in np.flatnonzero(force["support"])}
+    # In the order in which they are met, as generated.cpp's caller has them.
+    fields["bushing_joints"] = tuple(dict.fromkeys(joint for joint in joints if joint))
+    fields["bushing_columns"] = tuple(sorted(columns))
     return Structure(codes=numbers.codes(), **fields), np.array(numbers.values, dtype=float)
 
 
@@ -379,7 +391,7 @@ def _forces(numbers: _Numbers, forces: Sequence[Mapping[str, Any]]) -> tuple[For
     laws = 0
     for force in forces:
         if force["kind"] == BUSHING:
-            raise UnsupportedElementError("a force element is a bushing")
+            continue
         a, b = force.get("a", _NO_ANCHOR), force.get("b", _NO_ANCHOR)
         support = np.asarray(force.get("support", ()), dtype=float)
         columns = np.flatnonzero(support)

@@ -389,10 +389,10 @@ def compile_model(
         bool, typer.Option("--source", help="Print the C instead of compiling it.")
     ] = False,
 ) -> None:
-    """Compile code for one mechanism, which runs with --backend generated use.
+    """Compile code for one mechanism.
 
-    It needs a C compiler (cc, or the environment variable CC).  The code stays in the cache of the
-    user: srm-mbs cache shows where.
+    Runs with --backend generated use it.  It needs a C compiler (cc, or the environment variable
+    CC).  The code stays in the cache of the user: srm-mbs cache shows where.
     """
     from srm_mbs.integration.generated.code import generated_source
 

@@ -187,7 +187,8 @@ def joint_type_data(joint: Any) -> dict[str, Any]:
     if kind == "Composite":
         parts = zip(own.joints, own.jointPlacements)
         out["parts"] = [
-            {"kind": joint_type_data(part), "placement": _placement_numbers(at)} for part, at in parts
+            {"kind": joint_type_data(part), "placement": _placement_numbers(at)}
+            for part, at in parts
         ]
     elif kind == "RevoluteUnboundedUnaligned":
         out["axes"] = [_axis_of_subspace(joint)]

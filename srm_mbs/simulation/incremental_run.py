@@ -26,10 +26,10 @@ from srm_mbs.integration.control.step_size import (
 )
 from srm_mbs.integration.critical_passages import CriticalPassages, examined_passages
 from srm_mbs.integration.driver import RunStatus, integrate
+from srm_mbs.integration.generated.code import load_code
 from srm_mbs.integration.kernel.driver import why_stopped
 from srm_mbs.integration.kernel.marshalling import state_struct
 from srm_mbs.integration.kernel.run import CHUNK, CompiledRun, ReturnReason
-from srm_mbs.integration.generated.code import load_code
 from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
 from srm_mbs.integration.singular_endpoints import start

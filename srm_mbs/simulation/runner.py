@@ -47,8 +47,8 @@ from srm_mbs.integration.critical_passages import CriticalPassages, examined_pas
 from srm_mbs.integration.dense_output import DenseOutput, StepData
 from srm_mbs.integration.driver import RunRecord, RunStatus, StepSink
 from srm_mbs.integration.events import EventWatch, StateFunction, prepare_events
-from srm_mbs.integration.kernel import driver as kernel_driver
 from srm_mbs.integration.generated.code import load_code
+from srm_mbs.integration.kernel import driver as kernel_driver
 from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
@@ -434,9 +434,7 @@ def assemble_problem(
     passages = examined_passages(
         system, method, norm, options.placement, options.singular_tolerance
     )
-    problem = Problem(
-        mechanism, options, system, norm, state, intervals, by, held, watch, passages
-    )
+    problem = Problem(mechanism, options, system, norm, state, intervals, by, held, watch, passages)
     problem.code = code
     problem.kernel_system, problem.last_step = kernel_system, last_step
     problem.stiff = before is not None and bool(before.steps.stiff[-1:].any())

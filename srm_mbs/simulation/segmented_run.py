@@ -30,9 +30,9 @@ from srm_mbs.integration.events import (
     same_time,
     stop_message,
 )
-from srm_mbs.integration.kernel.system import Evaluator
 from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.dense_output import code_for
+from srm_mbs.integration.kernel.system import Evaluator
 from srm_mbs.integration.kernel.system import workspace as workspace_of
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve

@@ -103,7 +103,7 @@ def compiler() -> Compiler | None:
 
 @cache
 def processor() -> str:
-    """What a compiler sees of this processor when it compiles for it."""
+    """The properties of this processor that a compiler sees when it compiles for it."""
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(errors="replace").split("\n\n", 1)[0].splitlines()
         kept = ("vendor_id", "cpu family", "model", "stepping", "flags", "Features", "CPU ")

@@ -102,7 +102,7 @@ class Recorder:
         return found
 
     def leaf(self, text: str, depends: int = VARIABLE) -> Expression:
-        """What C reads as ``text``: a new node at each call."""
+        """A number that C reads as ``text``: a new node at each call."""
         return Expression(self, "leaf", (), depends, text=text)
 
     def node(self, operand: Operand) -> Expression:
@@ -110,7 +110,7 @@ class Recorder:
         return operand if isinstance(operand, Expression) else self.constant(operand)
 
     def _record(self, operation: str, *operands: Expression) -> Expression:
-        key = (operation, *(operand.number for operand in operands))
+        key: tuple[str | int, ...] = (operation, *[operand.number for operand in operands])
         found = self._nodes.get(key)
         if found is None:
             depends = max(operand.depends for operand in operands)
@@ -209,7 +209,7 @@ class Recorder:
 
 
 class Output(NamedTuple):
-    """What the function computes: C assigns ``value`` to ``target``."""
+    """A result of the function: C assigns ``value`` to ``target``."""
 
     target: str
     value: Expression
@@ -322,7 +322,7 @@ def write_c(outputs: Sequence[Output], guards: Sequence[Guard] = ()) -> Written:
     done: set[int] = set()
     count = len(outputs)
 
-    def emit(root: Expression) -> str:
+    def evaluate(root: Expression) -> str:
         nonlocal count
         for node in _live((root,), done):
             if node.depends == VARIABLE and node.operands:
@@ -331,8 +331,16 @@ def write_c(outputs: Sequence[Output], guards: Sequence[Guard] = ()) -> Written:
                 count += 1
         return names.of(root)
 
+    def check(guard: Guard) -> None:
+        value, bound = evaluate(guard.value), evaluate(guard.bound)
+        terms.append(f"  if ({value} < {bound}) return 1;")
+
+    def assign(out: Output) -> None:
+        value = evaluate(out.value)
+        terms.append(f"  {out.target} = {value};")
+
     for guard in guards:
-        terms.append(f"  if ({emit(guard.value)} < {emit(guard.bound)}) return 1;")
+        check(guard)
     for out in outputs:
-        terms.append(f"  {out.target} = {emit(out.value)};")
+        assign(out)
     return Written("\n".join(constants), "\n".join(terms), len(places), count)

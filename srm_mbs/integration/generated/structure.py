@@ -1,8 +1,9 @@
-"""What the generated code of a mechanism depends on, apart from the numbers in it.
+"""The structure of a mechanism, on which its generated code depends, and the numbers in it.
 
 :func:`structure_of` splits the constants of a system into a :class:`Structure`, which is hashable,
 and a vector of parameters.  The structure knows of each number only whether it is 0 or not and,
-where it is a sign or part of a direction, whether it is 1 or -1, so that mechanisms of one topology share one function.
+where it is a sign or part of a direction, whether it is 1 or -1, so that mechanisms of one topology
+share one function.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class Span(NamedTuple):
     """Consecutive numbers of the vector of parameters."""
 
     start: int
-    count: int
+    length: int
 
 
 class Motion(NamedTuple):
@@ -252,7 +253,7 @@ class _Numbers:
     def rotated(self, placement: Sequence[float]) -> Span:
         """Append a placement (12); of its rotation, what is rounding is left out."""
         span = self.take([_rounded(x) for x in placement[:9]], units=True)
-        return Span(span.start, span.count + self.take(placement[9:]).count)
+        return Span(span.start, span.length + self.take(placement[9:]).length)
 
 
 def _rounded(x: float) -> float:
@@ -264,9 +265,10 @@ def _rounded(x: float) -> float:
 def _inertia(body: pin.Inertia) -> list[float]:
     moments = body.inertia[np.triu_indices(3)]
     moments[np.abs(moments) <= ROUNDING * np.abs(moments).max()] = 0.0
+    tensor: list[float] = moments.tolist()
     if body.mass == 0.0:
-        return [0.0] * 4 + moments.tolist()
-    return [float(body.mass), *body.lever.tolist(), *moments.tolist()]
+        return [*[0.0] * 4, *tensor]
+    return [float(body.mass), *body.lever.tolist(), *tensor]
 
 
 def _signs(support: FloatArray) -> tuple[tuple[int, int], ...]:
@@ -298,7 +300,7 @@ def structure_of(model: pin.Model, constants: Mapping[str, Any]) -> tuple[Struct
     if len(model.mimicking_joints):
         raise UnsupportedElementError("the model has mimic joints")
     motions, bodies = _tree(model, numbers)
-    fields = {
+    fields: dict[str, Any] = {
         "nq": int(model.nq),
         "nv": int(model.nv),
         "rows": int(constants["rows"]),
@@ -337,9 +339,7 @@ def _tree(model: pin.Model, numbers: _Numbers) -> tuple[tuple[Motion, ...], tupl
             own = _inertia(model.inertias[i]) if part is parts[-1] else massless
             spans = numbers.take(part.axis, units=True), numbers.take(part.pitch)
             placed = numbers.rotated(part.placement)
-            motions.append(
-                Motion(part.kind, parent, in_q, in_v, *spans, placed, numbers.take(own))
-            )
+            motions.append(Motion(part.kind, parent, in_q, in_v, *spans, placed, numbers.take(own)))
             parent = len(motions) - 1
             nq, nv = _SIZES.get(part.kind, (2 if part.kind == "unbounded" else 1, 1))
             in_q, in_v = in_q + nq, in_v + nv
@@ -359,10 +359,17 @@ def _closure(
     distances: FloatArray,
     alignments: FloatArray,
 ) -> Closure:
-    spans = [numbers.take(array.tolist()) for array in (at_a, at_b)]
-    arrays = (directions, distances, alignments)
-    spans += [numbers.take(array.tolist(), units=True) for array in arrays]
-    return Closure(joint_a, joint_b, first_row, *spans, _signs(support))
+    return Closure(
+        joint_a,
+        joint_b,
+        first_row,
+        numbers.take(at_a.tolist()),
+        numbers.take(at_b.tolist()),
+        numbers.take(directions.tolist(), units=True),
+        numbers.take(distances.tolist(), units=True),
+        numbers.take(alignments.tolist(), units=True),
+        _signs(support),
+    )
 
 
 def _row(

@@ -13,13 +13,13 @@ algorithm (R. Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 5 and
 has them.  The rows are those of :mod:`srm_mbs.dynamics.constraints.rows`, the forces those of
 :mod:`srm_mbs.dynamics.forces`.
 
-Left to the kernel: bushings, whose kinematics the terms compute, forces along coordinates (damping, friction, controllers), motions of drives,
-laws over time, whose values the terms take, and all algebra.
+Left to the kernel: bushings, whose kinematics the terms compute, forces along coordinates (damping,
+friction, controllers), motions of drives, laws over time, whose values the terms take, and all
+algebra.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from srm_mbs.integration.generated.expressions import (
@@ -28,7 +28,6 @@ from srm_mbs.integration.generated.expressions import (
     Guard,
     Output,
     Recorder,
-    Written,
     write_c,
 )
 from srm_mbs.integration.generated.structure import (
@@ -224,7 +223,7 @@ class _Trace:
         """Of each motion, its own."""
 
     def take(self, span: Span) -> list[Expression]:
-        return self.parameters[span.start : span.start + span.count]
+        return self.parameters[span.start : span.start + span.length]
 
     def vector(self, span: Span) -> Vector:
         x, y, z = self.take(span)
@@ -271,7 +270,7 @@ class _Trace:
         )
 
     def _joint(self, motion: Motion) -> tuple[Matrix, Vector, list[tuple[Vector, Vector]]]:
-        """Rotation, translation, and the columns (linear, angular) of the motion in its own axes."""
+        """Rotation, translation, and the columns (linear, angular) of the motion in its axes."""
         q, first, kind = self.q, motion.in_q, motion.kind
         none, units = self.nothing, self.units
         if kind in ("revolute", "unbounded", "helical"):
@@ -407,8 +406,8 @@ class _Trace:
         for closure in self.structure.closures:
             self._positions(closure, columns, g, bias, G)
             self._alignments(closure, columns, g, bias, G)
-        for row in self.structure.coordinate_rows:
-            self._coordinates(row, g, bias, G)
+        for own in self.structure.coordinate_rows:
+            self._coordinates(own, g, bias, G)
         for row, other, factor, changed in self.structure.subtractions:
             by = self.take(factor)[0]
             g[row] = g[row] - by * g[other]
@@ -474,7 +473,7 @@ class _Trace:
         a, b = self.body(closure.joint_a), self.body(closure.joint_b)
         w = _subtract(a.spin, b.spin)
         change = _subtract(_subtract(a.spin_bias, b.spin_bias), _cross(b.spin, a.spin))
-        row = closure.first_row + closure.directions.count // 3 + closure.distances.count // 2
+        row = closure.first_row + closure.directions.length // 3 + closure.distances.length // 2
         for k in range(0, len(numbers), 6):
             m = _times(a.rotation, (numbers[k], numbers[k + 1], numbers[k + 2]))
             n = _times(b.rotation, (numbers[k + 3], numbers[k + 4], numbers[k + 5]))
@@ -576,8 +575,7 @@ class _Trace:
         return [
             (
                 j,
-                factor
-                * (_dot(columns[j].linear, acting) + _dot(columns[j].angular, about_origin)),
+                factor * (_dot(columns[j].linear, acting) + _dot(columns[j].angular, about_origin)),
             )
             for j, factor in zip(force.columns, factors)
         ]
@@ -681,7 +679,7 @@ def source_of(structure: Structure) -> Source:
         why = "the two points of an element coincide in every configuration"
         raise UnsupportedElementError(why) from error
     written = write_c(trace.outputs, trace.guards)
-    laws = sum(force.laws.count for force in structure.forces)
+    laws = sum(force.laws.length for force in structure.forces)
     sizes = (
         *(ABI, structure.nq, structure.nv, structure.rows),
         *(len(structure.codes), written.constant_count, laws, len(structure.bushing_joints)),

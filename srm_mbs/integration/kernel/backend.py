@@ -67,9 +67,7 @@ def unsupported_reason(method: Method, placement: str, singular_times: FloatArra
     return None
 
 
-def chosen_backend(
-    asked: str, method: Method, placement: str, singular_times: FloatArray
-) -> str:
+def chosen_backend(asked: str, method: Method, placement: str, singular_times: FloatArray) -> str:
     """The backend of a run with ``backend=asked``: ``"python"``, ``"kernel"``, or ``"generated"``.
 
     Warns, once per process, where the kernel would make the run if it were available.

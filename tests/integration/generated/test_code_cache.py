@@ -135,9 +135,7 @@ def test_a_full_disk_leaves_nothing_half_written(
     assert not list(folder.iterdir())
 
 
-def test_the_cache_keeps_what_was_used_last(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_cache_keeps_what_was_used_last(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sources = [f"int seven(void) {{ return 7 + {i} * 0; }}\n" for i in range(3)]
     first = compile_and_load(sources[0], _seven)[1].path
     second = compile_and_load(sources[1], _seven)[1].path

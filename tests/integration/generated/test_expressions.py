@@ -38,7 +38,7 @@ def test_constants_zeros_and_units_drop_out(recorder: Recorder, x: Expression) -
     assert (2.0 * recorder.constant(3.0) - 5.0).value == 1.0
     assert (x * 0.0).is_zero
     assert (0.0 / x).is_zero
-    for same in (x + 0.0, 0.0 + x, x - 0.0, 1.0 * x, x / 1.0, -(-x), -1.0 * (x * -1.0)):
+    for same in (x + 0.0, 0.0 + x, x - 0.0, 1.0 * x, x / 1.0, 0.0 - (0.0 - x), -1.0 * (x * -1.0)):
         assert same is x
 
 

@@ -76,7 +76,9 @@ def _tree(make: Callable[[], object]) -> srm.Mechanism:
         index = model.addJoint(parent, joint, placement, name)
         body = rod(rng.uniform(0.5, 2.0))
         body.lever = rng.uniform(-0.5, 0.5, 3)
-        model.appendBodyToJoint(index, body, pin.SE3(pin.rpy.rpyToMatrix(*rng.normal(size=3)), np.zeros(3)))
+        model.appendBodyToJoint(
+            index, body, pin.SE3(pin.rpy.rpyToMatrix(*rng.normal(size=3)), np.zeros(3))
+        )
         model.addBodyFrame(name, index, pin.SE3.Identity(), 0)
         return index
 
@@ -187,7 +189,11 @@ FORCES = {
         rest_length=0.7,
     ),
     "spring without length": srm.SpringDamper(
-        srm.Anchor("body_4", xyz=(0.1, 0.2, 0.3)), srm.Anchor("world"), stiffness=40.0, damping=3.0, rest_length=0.0
+        srm.Anchor("body_4", xyz=(0.1, 0.2, 0.3)),
+        srm.Anchor("world"),
+        stiffness=40.0,
+        damping=3.0,
+        rest_length=0.0,
     ),
     "torque": srm.JointTorque("j1", 2.5),
     "torque over time": srm.JointTorque("j1", 2.5, law=srm.Sine(1.0, frequency_hz=2.0)),

@@ -47,7 +47,7 @@ from srm_mbs.integration.critical_passages import CriticalPassages, examined_pas
 from srm_mbs.integration.dense_output import DenseOutput, StepData
 from srm_mbs.integration.driver import RunRecord, RunStatus, StepSink
 from srm_mbs.integration.events import EventWatch, StateFunction, prepare_events
-from srm_mbs.integration.generated.code import load_code
+from srm_mbs.integration.generated.code import code_of_run
 from srm_mbs.integration.kernel import driver as kernel_driver
 from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
@@ -405,7 +405,7 @@ def assemble_problem(
         by = chosen_backend(options.backend, method, options.placement, options.singular_times)
     else:
         by = before.settings.backend
-    code = load_code(mechanism) if by == "generated" else None
+    by, code = code_of_run(by, options.backend, mechanism)
     mechanism, state = initial_state(mechanism, t0, options.q0, options.v0)
     norm = error_norm(mechanism, options)
     held = None if options.sample_time is None else HeldForce()

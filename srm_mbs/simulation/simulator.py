@@ -15,6 +15,7 @@ from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import EvaluationError, InputError, SimulationError, safe_repr
 from srm_mbs.integration.breakpoints import smooth_intervals
+from srm_mbs.integration.generated.code import code_of_run
 from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -87,9 +88,8 @@ class Simulator:
         check_consistent(mechanism)
         self._mechanism, self._options = mechanism, options
         self._norm = error_norm(mechanism, options)
-        self._backend = chosen_backend(
-            backend, options.method, options.placement, options.singular_times
-        )
+        by = chosen_backend(backend, options.method, options.placement, options.singular_times)
+        self._backend, _ = code_of_run(by, backend, mechanism)
         self._no_force = np.zeros(mechanism.model.nv)
         self._make()
         self.reset()

@@ -42,8 +42,8 @@ class GeneratedFunction:
         self.library, _ = compile_and_load(
             source_of(self.structure).text, lambda path: ctypes.CDLL(str(path))
         )
-        sizes = (ctypes.c_int * 8).in_dll(self.library, "srm_mbs_sizes")
-        self.k = np.zeros(sizes[5])
+        sizes = (ctypes.c_int * 9).in_dll(self.library, "srm_mbs_sizes")
+        self.k = np.zeros(sizes[6])
         self.library.srm_mbs_constants(_pointer(parameters), _pointer(self.k))
 
     def __call__(self, q: FloatArray, v: FloatArray) -> Terms:

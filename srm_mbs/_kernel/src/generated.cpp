@@ -11,7 +11,7 @@ namespace {
 constexpr int interface_version = 1;  // ABI in integration/generated/terms.py
 
 // Places in srm_mbs_sizes.
-enum Size { version, coordinates, rates, rows_of, parameters_of, constants_of, laws_of, bodies_of };
+enum Size { version, coordinates, rates, rows_of, rank_of, parameters_of, constants_of, laws_of, bodies_of };
 
 }  // namespace
 
@@ -29,6 +29,7 @@ GeneratedTerms::GeneratedTerms(const std::string& path, const std::vector<double
         throw std::invalid_argument(path + " has another interface");
     terms_ = reinterpret_cast<Terms*>(find("srm_mbs_terms"));
     set_constants_ = reinterpret_cast<Constants*>(find("srm_mbs_constants"));
+    factor_ = reinterpret_cast<Factor*>(dlsym(handle, "srm_mbs_factor"));
     set_parameters(parameters);
 }
 
@@ -44,9 +45,9 @@ void GeneratedTerms::set_parameters(const std::vector<double>& parameters) {
     set_constants_(parameters.data(), constants_.data());
 }
 
-void GeneratedTerms::check(int nq, int nv, int rows, int laws, int bodies) const {
+void GeneratedTerms::check(int nq, int nv, int rows, int rank, int laws, int bodies) const {
     if (sizes_[coordinates] != nq || sizes_[rates] != nv || sizes_[rows_of] != rows ||
-        sizes_[laws_of] != laws || sizes_[bodies_of] != bodies)
+        sizes_[rank_of] != rank || sizes_[laws_of] != laws || sizes_[bodies_of] != bodies)
         throw std::invalid_argument("the code was generated for a system of another size");
 }
 

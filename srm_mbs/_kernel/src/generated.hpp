@@ -26,8 +26,14 @@ public:
                   double* J) const {
         return terms_(q, v, constants_.data(), laws, M, nle, tau, g, bias, G, B, J) == 0;
     }
+    // The factorisation of a DenseProjection: M, f, bias; A_, U_, inverse_, white_force, gamma_, tau_,
+    // inverse_pivots_, row_squares_, order_.  Not 0 where M is not positive definite.
+    using Factor = int(const double*, const double*, const double*, double*, double*, double*,
+                       double*, double*, double*, double*, double*, int*);
+    // Null where none was generated.
+    Factor* factor() const { return factor_; }
     // Throws std::invalid_argument for a system of other sizes.
-    void check(int nq, int nv, int rows, int laws, int bodies) const;
+    void check(int nq, int nv, int rows, int rank, int laws, int bodies) const;
 
 private:
     using Terms = int(const double*, const double*, const double*, const double*, double*, double*,
@@ -38,6 +44,7 @@ private:
     std::shared_ptr<void> library_;
     Terms* terms_;
     Constants* set_constants_;
+    Factor* factor_;
     const int* sizes_;
     std::vector<double> constants_;
 };

@@ -583,7 +583,8 @@ void System::use_code(const GeneratedTerms* code) {
                 if (joint && std::find(joints.begin(), joints.end(), joint) == joints.end())
                     joints.push_back(joint);
         }
-        code->check(nq, nv, data_.rows, static_cast<int>(laws), static_cast<int>(joints.size()));
+        code->check(nq, nv, data_.rows, data_.structural_rank, static_cast<int>(laws),
+                    static_cast<int>(joints.size()));
         law_values_.resize(laws);
         columns_of_rows_.resize(data_.rows);
         bushing_bodies_.clear();
@@ -595,6 +596,17 @@ void System::use_code(const GeneratedTerms* code) {
         }
     }
     code_ = code;
+    if (!closed_) return;
+    GeneratedTerms::Factor* const factor = code ? code->factor() : nullptr;
+    if (factor && !generated_projection_)
+        generated_projection_ =
+            make_generated_projection(nv, data_.rows, data_.structural_rank, data_.sigma_ref);
+    if ((factor != nullptr) != uses_generated_projection_) {
+        std::swap(projection_, generated_projection_);
+        projection_->factorisations = 0;
+        uses_generated_projection_ = factor != nullptr;
+    }
+    if (factor) projection_->use_factor(factor);
 }
 
 // M, the forces f and the rows of the closures, by generated code.

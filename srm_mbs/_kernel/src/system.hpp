@@ -291,6 +291,8 @@ private:
     void factorise_mass();
     void generated_terms(double t, const double* state);
     const GeneratedTerms* code_ = nullptr;
+    std::unique_ptr<Projection> generated_projection_;  // or the other one, while it is in use
+    bool uses_generated_projection_ = false;
     std::vector<double> law_values_;  // of the forces' curves, for generated code
     std::vector<double*> columns_of_rows_;
     std::vector<ForceElement> bushing_elements_;  // and the memory of their kinematics

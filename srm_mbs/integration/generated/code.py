@@ -15,7 +15,7 @@ from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, get_logger
 from srm_mbs.integration.generated.code_cache import CompilationError, Compiled, compile_and_load
 from srm_mbs.integration.generated.structure import (
     Structure,
@@ -24,6 +24,8 @@ from srm_mbs.integration.generated.structure import (
 )
 from srm_mbs.integration.generated.terms import Source, source_of
 from srm_mbs.model.mechanism import MechanismData, per_model
+
+log = get_logger(__name__)
 
 MOST_OPERATIONS = 40_000
 """Statements of generated code: compilation takes about 0.15 ms each, and more for each the more
@@ -97,6 +99,32 @@ def load_code(mechanism: Mechanism) -> Any:
         found = _library(structure, parameters).terms.with_parameters(parameters)
         _loaded(mechanism).append(found)
     return found
+
+
+def code_of_run(by: str, asked: str, mechanism: Mechanism) -> tuple[str, Any]:
+    """Backend of a run of ``mechanism``, and its ``GeneratedTerms`` or None.
+
+    Parameters
+    ----------
+    by
+        From :func:`~srm_mbs.integration.kernel.backend.chosen_backend`.
+    asked
+        The option ``backend``: with ``"auto"``, the kernel runs where there is no code.
+
+    Raises
+    ------
+    InputError
+        If generated code is insisted on and cannot be made.
+    """
+    if by != "generated":
+        return by, None
+    try:
+        return by, load_code(mechanism)
+    except InputError as error:
+        if asked != "auto":
+            raise
+        log.info("the kernel makes this run without generated code: %s", error)
+        return "kernel", None
 
 
 def compile_mechanism(mechanism: Mechanism) -> CompiledMechanism:

@@ -141,6 +141,7 @@ class Structure(NamedTuple):
     nq: int
     nv: int
     rows: int
+    rank: int
     gravity: Span
     armature: Span
     coincident: Span
@@ -304,6 +305,7 @@ def structure_of(model: pin.Model, constants: Mapping[str, Any]) -> tuple[Struct
         "nq": int(model.nq),
         "nv": int(model.nv),
         "rows": int(constants["rows"]),
+        "rank": int(constants["structural_rank"]),
         "gravity": numbers.take(model.gravity.vector.tolist()),
         "armature": numbers.take(model.armature.tolist()),
         "coincident": numbers.take([float(constants["coincident"])]),

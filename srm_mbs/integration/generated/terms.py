@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from srm_mbs.integration.generated.algebra import algebra_of
 from srm_mbs.integration.generated.expressions import (
     PARAMETER,
     Expression,
@@ -662,7 +663,8 @@ def source_of(structure: Structure) -> Source:
     """The C source of the terms of ``structure``.
 
     It defines ``srm_mbs_sizes``, the sizes of its arguments; ``srm_mbs_constants``, which computes
-    k from the parameters p; and ``srm_mbs_terms``, of an evaluation (generated.hpp).
+    k from the parameters p; ``srm_mbs_terms``, of an evaluation; and ``srm_mbs_factor``, the algebra of
+    one (generated.hpp).
 
     Raises
     ------
@@ -681,12 +683,13 @@ def source_of(structure: Structure) -> Source:
     written = write_c(trace.outputs, trace.guards)
     laws = sum(force.laws.length for force in structure.forces)
     sizes = (
-        *(ABI, structure.nq, structure.nv, structure.rows),
+        *(ABI, structure.nq, structure.nv, structure.rows, structure.rank),
         *(len(structure.codes), written.constant_count, laws, len(structure.bushing_joints)),
     )
     text = _TEMPLATE.format(
         sizes=", ".join(map(str, sizes)), constants=written.constants, terms=written.terms
     )
+    text += algebra_of(structure.nv, structure.rows, structure.rank)
     return Source(text, written.operations)
 
 

@@ -11,6 +11,7 @@ from functools import cache
 from srm_mbs._kernel import core, missing, remedy
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, get_logger, safe_repr, warn
+from srm_mbs.integration.generated.code_cache import compiler
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.psrm import PSRM
 
@@ -24,12 +25,21 @@ PLACEMENTS = ("automatic", "off")
 
 
 def backend() -> str:
-    """The backend that ``backend="auto"`` takes where it can: ``"kernel"`` or ``"python"``.
+    """The backend that ``backend="auto"`` takes where it can: ``"kernel"``, ``"python"`` or
+    ``"generated"``.
 
     ``"python"`` where there is no kernel (``srm-mbs info`` says why), or where the environment
-    variable SRM_MBS_BACKEND is ``python``.
+    variable SRM_MBS_BACKEND is ``python``; ``"generated"`` where that variable is ``generated`` and
+    there is a C compiler.
     """
-    return "python" if core is None or _unwanted() else "kernel"
+    if core is None or _unwanted():
+        return "python"
+    return "generated" if generated_wanted() else "kernel"
+
+
+def generated_wanted() -> bool:
+    """Whether runs with ``backend="auto"`` take generated code where they can."""
+    return os.environ.get("SRM_MBS_BACKEND") == "generated" and compiler() is not None
 
 
 def _unwanted() -> bool:
@@ -68,7 +78,9 @@ def unsupported_reason(method: Method, placement: str, singular_times: FloatArra
 
 
 def chosen_backend(asked: str, method: Method, placement: str, singular_times: FloatArray) -> str:
-    """The backend of a run with ``backend=asked``: ``"python"``, ``"kernel"``, or ``"generated"``.
+    """The backend of a run with ``backend=asked``: ``"python"``, ``"kernel"``, or ``"generated"``;
+    the last one for ``"auto"``, too, where it is wanted and the mechanism allows it
+    (:func:`~srm_mbs.integration.generated.code.code_of_run`).
 
     Warns, once per process, where the kernel would make the run if it were available.
 
@@ -99,7 +111,9 @@ def chosen_backend(asked: str, method: Method, placement: str, singular_times: F
         warn_missing()
     if core is None or lacking:
         return "python"
-    return "kernel" if asked == "auto" else asked
+    if asked != "auto":
+        return asked
+    return "generated" if generated_wanted() else "kernel"
 
 
 @cache

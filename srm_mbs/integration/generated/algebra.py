@@ -9,8 +9,11 @@ that are done take part in later steps, where nothing reads them.
 
 from __future__ import annotations
 
-LARGEST = 64
-"""Coordinates or rows up to which it is generated; beyond them other algebra takes over."""
+SMALLEST = 3
+"""Coordinates from which it is generated: the kernel's loops over fewer are unrolled, too."""
+LARGEST = 48
+"""Coordinates or rows up to which it is generated: beyond them the kernel's sparse algebra costs
+less."""
 
 
 def algebra_of(nv: int, rows: int, rank: int) -> str:
@@ -21,7 +24,7 @@ def algebra_of(nv: int, rows: int, rank: int) -> str:
     nv, rows, rank
         Coordinates, rows of G, and the structural rank.
     """
-    if rank == 0 or max(nv, rows) > LARGEST:
+    if rank == 0 or nv < SMALLEST or max(nv, rows) > LARGEST:
         return ""
     sizes = f"enum {{ N = {nv}, ROWS = {rows}, RANK = {rank} }};"
     return _FACTOR.replace("@SIZES@", sizes)
@@ -38,7 +41,7 @@ _FACTOR = """
 #define LANES 2
 #endif
 typedef double vec __attribute__((vector_size(8 * LANES)));
-enum { WIDE = ROWS / LANES + 1, HIGH = (N + LANES - 1) / LANES };
+enum { WIDE = (ROWS + LANES - 1) / LANES, HIGH = N / LANES + 1 };
 #define EACH(b, count) _Pragma("GCC unroll 16") for (int b = 0; b < count; ++b)
 
 /* From M and G (in A, row by row), f and bias: U with M = U^T U and the inverse of its diagonal,
@@ -49,14 +52,14 @@ int srm_mbs_factor(const double *restrict M, const double *restrict f, const dou
                    double *restrict white, double *restrict gamma, double *restrict tau,
                    double *restrict inverse_pivots, double *restrict row_squares,
                    int *restrict order) {
-  vec X[N][WIDE], C[N][HIGH];  /* W and, in its column ROWS, L^-1 f; U */
+  vec X[N][WIDE], C[N][HIGH];  /* W; U and, in its column N, L^-1 f */
   for (int i = 0; i < N; ++i) {
     double *const row = (double *)X[i], *const upper = (double *)C[i];
     EACH(b, WIDE) X[i][b] = (vec){0};
     EACH(b, HIGH) C[i][b] = (vec){0};
     for (int j = 0; j < ROWS; ++j) row[j] = A[j * N + i];
-    row[ROWS] = f[i];
     for (int j = i; j < N; ++j) upper[j] = M[j * N + i];
+    upper[N] = f[i];
   }
   for (int k = 0; k < N; ++k) {
     const double *const own = (const double *)C[k];
@@ -79,7 +82,7 @@ int srm_mbs_factor(const double *restrict M, const double *restrict f, const dou
   vec sums[WIDE], squares[WIDE];
   EACH(b, WIDE) sums[b] = squares[b] = (vec){0};
   for (int i = 0; i < N; ++i) {
-    const double w = white[i] = ((const double *)X[i])[ROWS];
+    const double w = white[i] = ((const double *)C[i])[N];
     EACH(b, WIDE) {
       sums[b] += w * X[i][b];
       squares[b] += X[i][b] * X[i][b];

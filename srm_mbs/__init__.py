@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from srm_mbs.analysis.linearisation import Linearisation, linearise
     from srm_mbs.analysis.linkage import LinkageReport, linkage_report
     from srm_mbs.analysis.path_following import FollowedPath, follow
-    from srm_mbs.api import DaeSolution, Solution, load_solution, simulate, solve_dae
+    from srm_mbs.api import DaeSolution, Solution, compile, load_solution, simulate, solve_dae
     from srm_mbs.assembly.assemble import Assembly, assemble
     from srm_mbs.dynamics.mechanism import Mechanism
     from srm_mbs.errors import (
@@ -74,7 +74,7 @@ _NAMES = {
     "analysis.linkage": "LinkageReport linkage_report",
     "analysis.linearisation": "Linearisation linearise",
     "analysis.path_following": "FollowedPath follow",
-    "api": "DaeSolution Solution load_solution simulate solve_dae",
+    "api": "DaeSolution Solution compile load_solution simulate solve_dae",
     "assembly.assemble": "Assembly assemble",
     "dynamics.mechanism": "Mechanism",
     "errors": "__version__ AnalysisError AssemblyError InputError SimulationError SrmError "
@@ -166,6 +166,7 @@ __all__ = [
     "bundled_models",
     "certify",
     "closures_from_pinocchio",
+    "compile",
     "convert",
     "equilibrium",
     "follow",

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srm_mbs.dynamics.controllers import Controller
-from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.errors import FailedRunWarning, warn
 from srm_mbs.formats.files import checked_path
 from srm_mbs.integration.driver import RunStatus, Tick
+from srm_mbs.integration.generated.code import CompiledMechanism, compile_mechanism
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.anchors import Anchor
@@ -395,8 +396,9 @@ def simulate(
         True for a progress bar (on a terminal only), or a callable (t, h, state).
     backend
         ``"python"``, the readable reference; ``"kernel"``, the compiled kernel, which is many times
-        faster and has the split PSRM with automatic placement or none; ``"auto"``, the kernel
-        wherever it can be used (:func:`srm_mbs.backend`).
+        faster and has the split PSRM with automatic placement or none; ``"generated"``, the kernel
+        with code that is generated and compiled for this mechanism (:func:`srm_mbs.compile`);
+        ``"auto"``, the kernel wherever it can be used (:func:`srm_mbs.backend`).
     raise_on_failure
         Raise :class:`SimulationError` instead of returning a partial solution.
     singular_tolerance
@@ -559,3 +561,30 @@ def load_solution(
 
     checked = checked_path(path)
     return load_result(checked, SOLUTIONS, Reach.of(checked, mesh_dirs, allow_outside))
+
+
+def compile(mechanism: Mechanism) -> CompiledMechanism:
+    """Generate the code of a mechanism's terms and compile it, for ``backend="generated"``.
+
+    The code computes what an evaluation of this mechanism needs: constants, zeros and units are
+    gone.  It stays in a folder of the user's cache, and mechanisms of the same structure share it,
+    whatever their masses, lengths and stiffnesses (docs/kernel.md).
+
+    Parameters
+    ----------
+    mechanism
+        From :func:`srm_mbs.load`, or built from a ``pin.Model``.
+
+    Returns
+    -------
+    CompiledMechanism
+        Statements of one evaluation, time (s) that compilation took, or 0, where the code lies, and
+        its source in C.
+
+    Raises
+    ------
+    InputError
+        If no code can be generated for an element of the mechanism, or there is no C compiler.
+    """
+    check_mechanism(mechanism)
+    return compile_mechanism(mechanism)

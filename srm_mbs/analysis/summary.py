@@ -45,7 +45,11 @@ BUSHING_ANGULAR = [False, False, False, True, True, True]
 """Which of the six numbers of a bushing belong to angles."""
 MAX_STIFF = 5
 """Joints and force elements that are listed as stiff."""
-BACKENDS = {"kernel": "the compiled kernel", "python": "the Python reference"}
+BACKENDS = {
+    "generated": "the compiled kernel with generated code",
+    "kernel": "the compiled kernel",
+    "python": "the Python reference",
+}
 
 
 def run_rows(solution: SimulationResult, *, passages: bool = True) -> list[tuple[str, str]]:

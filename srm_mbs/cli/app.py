@@ -136,7 +136,7 @@ def simulate(
         float | None, option("H", "Fixed step (s) instead of step-size control.")
     ] = None,
     backend: Annotated[
-        str, option("auto|python|kernel", "Backend that computes the run.")
+        str, option("auto|python|kernel|generated", "Backend that computes the run.")
     ] = "auto",
     singular_tolerance: Annotated[
         float | None,
@@ -378,6 +378,51 @@ def info(file: ModelFile) -> None:
         echo("")
     for note in notes:
         echo(f"note: {note}")
+
+
+@app.command(name="compile")
+@reported
+@reads_model
+def compile_model(
+    file: ModelFile,
+    source: Annotated[
+        bool, typer.Option("--source", help="Print the C instead of compiling it.")
+    ] = False,
+) -> None:
+    """Compile code for one mechanism.
+
+    Runs with --backend generated use it.  It needs a C compiler (cc, or the environment variable
+    CC).  The code stays in the cache of the user: srm-mbs cache shows where.
+    """
+    from srm_mbs.integration.generated.code import generated_source
+
+    mechanism = file.load()
+    if source:
+        for line in generated_source(mechanism).splitlines():
+            echo(line)
+        return
+    made = srm_mbs.compile(mechanism)
+    how = f"compiled in {made.seconds:.2f} s" if made.seconds else "in the cache"
+    echo(f"{mechanism.name}: {made.operations} operations, {how}")
+    if made.path is None:
+        echo("note: the code could not be kept; --verbose says why")
+
+
+@app.command()
+@reported
+def cache(
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all compiled code.")] = False,
+) -> None:
+    """Show where compiled code of mechanisms lies, or remove it."""
+    from srm_mbs.integration.generated import code_cache
+
+    count, size = code_cache.clear() if clear else code_cache.contents()
+    rows = [
+        ("folder", str(code_cache.cache_folder())),
+        ("removed" if clear else "compiled mechanisms", f"{count}"),
+        ("size", f"{size / 1e6:.2f} MB"),
+    ]
+    table(rows)
 
 
 @app.command()

@@ -179,14 +179,16 @@ def _axis_of_subspace(joint: Any) -> list[float]:
     return [float(x) for x in data.S[3:]]
 
 
-def _type_data(joint: Any) -> dict[str, Any]:
+def joint_type_data(joint: Any) -> dict[str, Any]:
+    """A joint as :class:`JointTypeData` has it."""
     own = joint.extract()
     kind = joint.shortname().removeprefix("JointModel")
     out: dict[str, Any] = {"type": kind}
     if kind == "Composite":
         parts = zip(own.joints, own.jointPlacements)
         out["parts"] = [
-            {"kind": _type_data(part), "placement": _placement_numbers(at)} for part, at in parts
+            {"kind": joint_type_data(part), "placement": _placement_numbers(at)}
+            for part, at in parts
         ]
     elif kind == "RevoluteUnboundedUnaligned":
         out["axes"] = [_axis_of_subspace(joint)]
@@ -208,7 +210,7 @@ def model_to_data(model: pin.Model) -> dict[str, Any]:
             {
                 "name": model.names[i],
                 "parent": int(model.parents[i]),
-                "kind": _type_data(model.joints[i]),
+                "kind": joint_type_data(model.joints[i]),
                 "placement": _placement_numbers(model.jointPlacements[i]),
                 "inertia": _inertia_numbers(model.inertias[i]),
             }

@@ -26,6 +26,7 @@ from srm_mbs.integration.control.step_size import (
 )
 from srm_mbs.integration.critical_passages import CriticalPassages, examined_passages
 from srm_mbs.integration.driver import RunStatus, integrate
+from srm_mbs.integration.generated.code import load_code
 from srm_mbs.integration.kernel.driver import why_stopped
 from srm_mbs.integration.kernel.marshalling import state_struct
 from srm_mbs.integration.kernel.run import CHUNK, CompiledRun, ReturnReason
@@ -170,7 +171,8 @@ class KernelRun(IncrementalRun):
     def __post_init__(self) -> None:
         super().__post_init__()
         system, options = self.system, self.options
-        self._kernel_system = make_kernel_system(system)
+        code = load_code(system.mechanism) if options.backend == "generated" else None
+        self._kernel_system = make_kernel_system(system, code)
         self._evaluator = Evaluator(system, self._kernel_system)
         self._systems = (system, self._kernel_system)
         nothing = np.zeros(2 * system.nv)

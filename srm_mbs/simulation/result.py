@@ -34,6 +34,7 @@ from srm_mbs.integration.dense_output import (
 )
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import Occurrence
+from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import CompiledObservables
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.singular_passages import (
@@ -312,7 +313,7 @@ class SimulationResult(RunOutcome):
     @cached_property
     def observables(self) -> Observables:
         """Quantities at many states of the mechanism, by the backend of the run."""
-        by_kernel = self.settings.backend == "kernel" and core is not None
+        by_kernel = self.settings.backend in COMPILED and core is not None
         return (CompiledObservables if by_kernel else Observables)(self._system)
 
     @property

@@ -47,8 +47,9 @@ from srm_mbs.integration.critical_passages import CriticalPassages, examined_pas
 from srm_mbs.integration.dense_output import DenseOutput, StepData
 from srm_mbs.integration.driver import RunRecord, RunStatus, StepSink
 from srm_mbs.integration.events import EventWatch, StateFunction, prepare_events
+from srm_mbs.integration.generated.code import code_of_run
 from srm_mbs.integration.kernel import driver as kernel_driver
-from srm_mbs.integration.kernel.backend import uses_kernel
+from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
 from srm_mbs.integration.kernel.marshalling import state_from
@@ -131,8 +132,8 @@ class Problem:
         Initial state.
     intervals
         Where the right-hand side is smooth.
-    on_kernel
-        Whether the compiled kernel makes the run.
+    backend
+        Makes the run: ``"python"``, ``"kernel"`` or ``"generated"``.
     held
         The forces that a sampled controller held; None without one.
     watch
@@ -147,6 +148,8 @@ class Problem:
         Length (s) of the last step of the segment before, as far as it is used; 0 without one.
     stiff
         Whether that segment was stiff at its end.
+    code
+        The generated code that computes the terms; None without it.
     """
 
     mechanism: Mechanism
@@ -155,7 +158,7 @@ class Problem:
     norm: ErrorNorm
     state: FloatArray
     intervals: SmoothIntervals
-    on_kernel: bool
+    backend: str
     held: HeldForce | None
     watch: EventWatch | None
     passages: CriticalPassages | None
@@ -163,6 +166,7 @@ class Problem:
     stream: OutputStream | None = None
     last_step: float = 0.0
     stiff: bool = False
+    code: Any = None
 
 
 def run_segment(
@@ -184,8 +188,7 @@ def run_segment(
         mechanism was switched.
     """
     problem = assemble_problem(mechanism, options, before)
-    by = "kernel" if problem.on_kernel else "python"
-    log_start(mechanism.name, options, problem.norm, by)
+    log_start(mechanism.name, options, problem.norm, problem.backend)
     record, counters, kernel_system = integrate_problem(problem)
     if before is None:
         raise_at_first_call(record.error, options.t0)
@@ -399,9 +402,10 @@ def assemble_problem(
     intervals = smooth_intervals(times, samples, t0, t_end)
     check_avoidable(options.singular_times, intervals.ends, t_end - t0)
     if before is None:
-        on_kernel = uses_kernel(options.backend, method, options.placement, options.singular_times)
+        by = chosen_backend(options.backend, method, options.placement, options.singular_times)
     else:
-        on_kernel = before.settings.backend == "kernel"
+        by = before.settings.backend
+    by, code = code_of_run(by, options.backend, mechanism)
     mechanism, state = initial_state(mechanism, t0, options.q0, options.v0)
     norm = error_norm(mechanism, options)
     held = None if options.sample_time is None else HeldForce()
@@ -430,14 +434,12 @@ def assemble_problem(
     passages = examined_passages(
         system, method, norm, options.placement, options.singular_tolerance
     )
-    problem = Problem(
-        mechanism, options, system, norm, state, intervals, on_kernel, held, watch, passages
-    )
+    problem = Problem(mechanism, options, system, norm, state, intervals, by, held, watch, passages)
+    problem.code = code
     problem.kernel_system, problem.last_step = kernel_system, last_step
     problem.stiff = before is not None and bool(before.steps.stiff[-1:].any())
     # Sweeps say at the end what they met in their steps.
     if options.t_eval is not None and isinstance(method, PSRM) and method.correction == "split":
-        by = "kernel" if on_kernel else "python"
         problem.stream = OutputStream(system, method.scheme, options.t_eval, by)
     return problem
 
@@ -499,10 +501,12 @@ def integrate_problem(problem: Problem) -> tuple[RunRecord, Counters, Any]:
     kernel_system: Any = problem.kernel_system
     if kernel_system is not None:
         kernel_system.renew(**problem.system.constants_of_start())
-    made_here = problem.on_kernel and kernel_system is None
+    made_here = problem.backend in COMPILED and kernel_system is None
     try:
         with (
-            workspace(problem.system) if made_here else nullcontext(kernel_system) as kernel_system
+            workspace(problem.system, problem.code)
+            if made_here
+            else nullcontext(kernel_system) as kernel_system
         ):
             found = _integrate(problem, kernel_system)
             if _starts_too_fast(found[0], problem.options):
@@ -737,7 +741,7 @@ def assemble_result(
         end_state = record.stop_state if data.count == 1 else None
         if isinstance(record, CompiledRecord):
             own = None if shared(system) else kernel_system
-            dense = CompiledDenseOutput(own, system, scheme, data, end_state)
+            dense = CompiledDenseOutput(own, system, scheme, data, end_state, problem.backend)
         else:
             dense = DenseOutput(system, scheme, data, end_state)
         # Counted before anything below reads the dense output, which evaluates stages.
@@ -756,7 +760,6 @@ def assemble_result(
                 run_segment, mechanism, options._replace(t_eval=None, progress=False), result_type
             )
     controlled = options.controller is not None or system.has_user_forces
-    by = "kernel" if problem.on_kernel else "python"
     result = result_type(
         mechanism,
         system,
@@ -778,7 +781,7 @@ def assemble_result(
         + _half_turns(turned)
         + _driven_too_far(mechanism, record),
         stats=stats,
-        settings=settings(options, problem.norm, controlled, by, stiff),
+        settings=settings(options, problem.norm, controlled, problem.backend, stiff),
     )
     result.error = record.error
     return result

@@ -155,7 +155,7 @@ class SettingsEntry(StrictData):
     controlled: bool
     placement: Literal[tuple(PLACEMENTS)] = "automatic"  # type: ignore[valid-type]
     singular_times: Numbers = Field(default_factory=list)
-    backend: Literal["python", "kernel"] = "python"
+    backend: Literal["python", "kernel", "generated"] = "python"
     singular_tolerance: Tolerance = SINGULAR_TOLERANCE
 
 
@@ -185,7 +185,7 @@ class OptionsEntry(StrictData):
     breakpoints: Numbers
     placement: Literal[tuple(PLACEMENTS)]  # type: ignore[valid-type]
     singular_times: Numbers
-    backend: Literal["auto", "python", "kernel"]
+    backend: Literal["auto", "python", "kernel", "generated"]
     singular_tolerance: Tolerance = SINGULAR_TOLERANCE
 
 

@@ -30,6 +30,8 @@ from srm_mbs.integration.events import (
     same_time,
     stop_message,
 )
+from srm_mbs.integration.kernel.backend import COMPILED
+from srm_mbs.integration.kernel.dense_output import code_for
 from srm_mbs.integration.kernel.system import Evaluator
 from srm_mbs.integration.kernel.system import workspace as workspace_of
 from srm_mbs.model.drives import positions
@@ -613,12 +615,13 @@ def _after_actions(
 def _equations(part: SimulationResult) -> Iterator[Any]:
     """The equations of motion of ``part``, whose closures its kernel evaluates, if it can."""
     system = part.system
-    if not system.has_constraints or part.settings.backend != "kernel":
+    if not system.has_constraints or part.settings.backend not in COMPILED:
         yield system
     elif part.kernel_system is not None:
         yield Evaluator(system, part.kernel_system)
     else:
-        with workspace_of(system) as kernel_system:
+        code = code_for(part.settings.backend, system)
+        with workspace_of(system, code) as kernel_system:
             yield Evaluator(system, kernel_system)
 
 

@@ -22,7 +22,8 @@ from srm_mbs.errors import (
     safe_repr,
 )
 from srm_mbs.integration.breakpoints import smooth_intervals
-from srm_mbs.integration.kernel.backend import uses_kernel
+from srm_mbs.integration.generated.code import code_of_run
+from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.simulation.incremental_run import IncrementalRun, KernelRun, ReferenceRun
@@ -94,9 +95,8 @@ class Simulator:
         check_consistent(mechanism)
         self._mechanism, self._options = mechanism, options
         self._norm = error_norm(mechanism, options)
-        self._on_kernel = uses_kernel(
-            backend, options.method, options.placement, options.singular_times
-        )
+        by = chosen_backend(backend, options.method, options.placement, options.singular_times)
+        self._backend, _ = code_of_run(by, backend, mechanism)
         self._no_force = np.zeros(mechanism.model.nv)
         self._make()
         self.reset()
@@ -106,8 +106,9 @@ class Simulator:
         held = HeldForce()
         held.only(self._no_force)
         self._system = make_system(self._mechanism, held)
-        kind: type[IncrementalRun] = KernelRun if self._on_kernel else ReferenceRun
-        self._run = kind(self._system, held, self._norm, self._options)
+        options = self._options._replace(backend=self._backend)
+        kind: type[IncrementalRun] = KernelRun if self._backend in COMPILED else ReferenceRun
+        self._run = kind(self._system, held, self._norm, options)
         self._nq = self._mechanism.model.nq
         self._wall_time = 0.0
         self._last_dt = math.inf

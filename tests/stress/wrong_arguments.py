@@ -252,6 +252,7 @@ def calls(folder: Path) -> dict[str, Call]:
             srm.Simulator, (four_bar,), {"rtol": 1e-6, "step": None, "method": "psrm"}
         ),
         "backend": Call(srm.backend),
+        "compile": Call(srm.compile, (four_bar,)),
         "Simulator.step": Call(simulator.step, (0.001,)),
         "Solution()": Call(solution, (0.1,)),
         "Solution.at": Call(solution.at, ([0.1],)),

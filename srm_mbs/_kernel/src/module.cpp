@@ -114,7 +114,7 @@ void bind_structs(nb::module_& m) {
 // ---- System -------------------------------------------------------------------------------------
 
 struct PySystem {
-    nb::object model, controller;  // kept alive
+    nb::object model, controller, code;  // kept alive
     std::unique_ptr<System> system;
 
     PySystem(nb::object model_, const SystemData& data, nb::object controller_)
@@ -245,6 +245,12 @@ struct PySystem {
         return owned_array(std::move(out), {n, m});
     }
 
+    // Takes terms from a GeneratedTerms from now on; None: from the pass over the tree.
+    void use_code(nb::object generated) {
+        system->use_code(generated.is_none() ? nullptr : &nb::cast<const GeneratedTerms&>(generated));
+        code = std::move(generated);
+    }
+
     void hold(double t, const Array& force, bool keep) {
         system->hold(t, vector_of(force, system->nv, "force"), keep);
     }
@@ -256,8 +262,20 @@ struct PySystem {
 };
 
 void bind_system(nb::module_& m) {
+    nb::class_<GeneratedTerms>(m, "GeneratedTerms")
+        .def("__init__",
+             [](GeneratedTerms* self, const std::string& path, const Array& parameters) {
+                 new (self) GeneratedTerms(path, to_vector(parameters));
+             },
+             nb::arg("path"), nb::arg("parameters"))
+        .def("with_parameters",
+             [](const GeneratedTerms& self, const Array& parameters) {
+                 return GeneratedTerms(self, to_vector(parameters));
+             });
     nb::class_<PySystem>(
-        m, "System", nb::type_slots(collected<PySystem, &PySystem::model, &PySystem::controller>()))
+        m, "System",
+        nb::type_slots(collected<PySystem, &PySystem::model, &PySystem::controller,
+                                             &PySystem::code>()))
         .def(nb::init<nb::object, const SystemData&, nb::object>(), nb::arg("model"),
              nb::arg("data"), nb::arg("controller").none())
         .def("terms", &PySystem::terms, nb::arg("t"), nb::arg("state"), nb::arg("threshold") = -1.0)
@@ -276,6 +294,7 @@ void bind_system(nb::module_& m) {
         .def("powers", &PySystem::powers, nb::arg("t"), nb::arg("states"), nb::arg("elements"),
              nb::arg("resting"))
         .def("hold", &PySystem::hold)
+        .def("use_code", &PySystem::use_code, nb::arg("code").none())
         .def("renew", &PySystem::renew, nb::arg("unit"), nb::arg("gap_scale"),
              nb::arg("damping").none(), nb::arg("friction").none())
         .def_prop_ro("sparse", [](const PySystem& s) { return s.system->sparse(); })

@@ -570,11 +570,73 @@ void System::update_drives(double t, bool with_bias) {
     }
 }
 
+void System::use_code(const GeneratedTerms* code) {
+    if (code) {
+        std::size_t laws = 0;
+        std::vector<int> joints;
+        bushing_elements_.clear();
+        for (const ForceElement& force : data_.forces) {
+            laws += force.curves.size();
+            if (force.kind != ForceKind::bushing) continue;
+            bushing_elements_.push_back(force);
+            for (const int joint : {force.a.joint, force.b.joint})
+                if (joint && std::find(joints.begin(), joints.end(), joint) == joints.end())
+                    joints.push_back(joint);
+        }
+        code->check(nq, nv, data_.rows, data_.structural_rank, static_cast<int>(laws),
+                    static_cast<int>(joints.size()));
+        law_values_.resize(laws);
+        columns_of_rows_.resize(data_.rows);
+        bushing_bodies_.clear();
+        for (const int joint : joints) {
+            auto& at = work_->data.oMi[joint];
+            bushing_bodies_.push_back(at.rotation().data());
+            bushing_bodies_.push_back(at.translation().data());
+            bushing_bodies_.push_back(work_->data.v[joint].toVector().data());
+        }
+    }
+    code_ = code;
+    if (!closed_) return;
+    GeneratedTerms::Factor* const factor = code ? code->factor() : nullptr;
+    if (factor && !generated_projection_)
+        generated_projection_ =
+            make_generated_projection(nv, data_.rows, data_.structural_rank, data_.sigma_ref);
+    if ((factor != nullptr) != uses_generated_projection_) {
+        std::swap(projection_, generated_projection_);
+        projection_->factorisations = 0;
+        uses_generated_projection_ = factor != nullptr;
+    }
+    if (factor) projection_->use_factor(factor);
+}
+
+// M, the forces f and the rows of the closures, by generated code.
+void System::generated_terms(double t, const double* state) {
+    auto& w = *work_;
+    std::size_t law = 0;
+    double s[3];
+    for (const ForceElement& force : data_.forces)
+        for (const Curve& curve : force.curves) {
+            curve.at(t, s);
+            law_values_[law++] = s[0];
+        }
+    for (int row = 0; row < data_.rows; ++row) columns_of_rows_[row] = column(row);
+    if (!code_->evaluate(state, state + nq, law_values_.data(), w.data.M.data(), w.data.nle.data(),
+                         f_.data(), g_.data(), bias_.data(), columns_of_rows_.data(),
+                         bushing_bodies_.data(), w.data.J.data()))
+        throw EvaluationError{Failure::coincident};
+    if (!bushing_elements_.empty())
+        add_forces(bushing_elements_, data_.coincident, w, t, state, v_.data(), bushings_,
+                   f_.data(), nullptr);
+    for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
+}
+
 void System::tree_terms(const double* state) {
     auto& w = *work_;
     std::copy(state, state + nq, w.q.data());
     std::copy(state + nq, state + nq + nv, w.v.data());
-    if (closed_)
+    if (code_)
+        generated_terms(0.0, state);
+    else if (closed_)
         pinocchio_model::compute_terms(w);
     else
         pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
@@ -667,6 +729,14 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
         if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
         return;
     }
+    if (!closed_ && code_) {
+        generated_terms(t, state);
+        factorise_mass();
+        std::copy(f_.begin(), f_.end(), rate_.begin());
+        lu_solve(factors_.data(), nv, pivots_.data(), rate_.data());
+        if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
+        return;
+    }
     if (!closed_) {
         if (!data_.forces.empty()) {
             pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
@@ -680,14 +750,18 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
         if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
         return;
     }
-    pinocchio_model::compute_terms(w);
-    for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
-    if (joined)
-        joined_forces(t, state);
-    else if (!data_.forces.empty())
-        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
-                   laws);
-    update_closures(state, true);
+    if (code_ && !laws) {
+        generated_terms(t, state);
+    } else {
+        pinocchio_model::compute_terms(w);
+        for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
+        if (joined)
+            joined_forces(t, state);
+        else if (!data_.forces.empty())
+            add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
+                       laws);
+        update_closures(state, true);
+    }
     update_drives(t, true);
     Projection& p = *projection_;
     p.factor(w.data.M.data(), f_.data(), bias_.data(), zone.threshold);

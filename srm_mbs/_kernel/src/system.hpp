@@ -18,6 +18,7 @@
 #include "charts.hpp"
 #include "curve.hpp"
 #include "forces.hpp"
+#include "generated.hpp"
 #include "history.hpp"
 #include "projection.hpp"
 #include "struct_fields.hpp"
@@ -150,6 +151,9 @@ public:
     void evaluate(double t, const double* state, const ZoneView& zone);
     // The pass over the tree that an evaluation begins with, alone: to measure it.
     void tree_terms(const double* state);
+    // From now on evaluations take their terms from generated code, which outlives its use; null:
+    // from the pass over the tree.  Stages of stiff steps take them from there in any case.
+    void use_code(const GeneratedTerms* code);
     // Evaluates at times within [first, last] only: on one side of a breakpoint.
     void between(double first, double last) {
         first_ = first;
@@ -285,6 +289,14 @@ private:
     void joined_forces(double t, const double* q);
     void joined_values();
     void factorise_mass();
+    void generated_terms(double t, const double* state);
+    const GeneratedTerms* code_ = nullptr;
+    std::unique_ptr<Projection> generated_projection_;  // or the other one, while it is in use
+    bool uses_generated_projection_ = false;
+    std::vector<double> law_values_;  // of the forces' curves, for generated code
+    std::vector<double*> columns_of_rows_;
+    std::vector<ForceElement> bushing_elements_;  // and the memory of their kinematics
+    std::vector<double*> bushing_bodies_;
     ForceLaws laws_;
     // Elements with laws, and the others, where the laws are joined.
     std::vector<ForceElement> lawful_, lawless_;

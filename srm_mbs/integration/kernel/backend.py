@@ -11,23 +11,35 @@ from functools import cache
 from srm_mbs._kernel import core, missing, remedy
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, get_logger, safe_repr, warn
+from srm_mbs.integration.generated.code_cache import compiler
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.psrm import PSRM
 
 log = get_logger(__name__)
 
-BACKENDS = ("auto", "python", "kernel")
+BACKENDS = ("auto", "python", "kernel", "generated")
+COMPILED = ("kernel", "generated")
+"""Those of which the compiled kernel makes the runs."""
 PLACEMENTS = ("automatic", "off")
 """Those that the kernel has."""
 
 
 def backend() -> str:
-    """The backend that ``backend="auto"`` takes where it can: ``"kernel"`` or ``"python"``.
+    """The backend that ``backend="auto"`` takes where it can: ``"kernel"``, ``"python"`` or
+    ``"generated"``.
 
     ``"python"`` where there is no kernel (``srm-mbs info`` says why), or where the environment
-    variable SRM_MBS_BACKEND is ``python``.
+    variable SRM_MBS_BACKEND is ``python``; ``"generated"`` where that variable is ``generated`` and
+    there is a C compiler.
     """
-    return "python" if core is None or _unwanted() else "kernel"
+    if core is None or _unwanted():
+        return "python"
+    return "generated" if generated_wanted() else "kernel"
+
+
+def generated_wanted() -> bool:
+    """Whether runs with ``backend="auto"`` take generated code where they can."""
+    return os.environ.get("SRM_MBS_BACKEND") == "generated" and compiler() is not None
 
 
 def _unwanted() -> bool:
@@ -65,15 +77,17 @@ def unsupported_reason(method: Method, placement: str, singular_times: FloatArra
     return None
 
 
-def uses_kernel(asked: str, method: Method, placement: str, singular_times: FloatArray) -> bool:
-    """Whether a run with ``backend=asked`` is made by the compiled kernel.
+def chosen_backend(asked: str, method: Method, placement: str, singular_times: FloatArray) -> str:
+    """The backend of a run with ``backend=asked``: ``"python"``, ``"kernel"``, or ``"generated"``;
+    the last one for ``"auto"``, too, where it is wanted and the mechanism allows it
+    (:func:`~srm_mbs.integration.generated.code.code_of_run`).
 
     Warns, once per process, where the kernel would make the run if it were available.
 
     Raises
     ------
     InputError
-        If there is no such backend, or ``asked`` is the kernel and it cannot make the run.
+        If there is no such backend, or ``asked`` needs the kernel and it cannot make the run.
     """
     if not isinstance(asked, str) or asked not in BACKENDS:
         raise InputError(
@@ -82,9 +96,9 @@ def uses_kernel(asked: str, method: Method, placement: str, singular_times: Floa
             remedy=f"Known: {', '.join(BACKENDS)}",
         )
     if asked == "python" or (asked == "auto" and _unwanted()):
-        return False
+        return "python"
     lacking = unsupported_reason(method, placement, singular_times)
-    if asked == "kernel" and (lacking or core is None):
+    if asked in COMPILED and (lacking or core is None):
         other = "Use the backend auto, which takes the Python reference where it has to"
         raise InputError(
             f"the compiled kernel cannot make this run: {lacking or missing}",
@@ -95,7 +109,11 @@ def uses_kernel(asked: str, method: Method, placement: str, singular_times: Floa
         log.info("the Python reference makes this run, not the compiled kernel: %s", lacking)
     elif core is None:
         warn_missing()
-    return core is not None and not lacking
+    if core is None or lacking:
+        return "python"
+    if asked != "auto":
+        return asked
+    return "generated" if generated_wanted() else "kernel"
 
 
 @cache

@@ -11,7 +11,9 @@ from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.integration.dense_output import DenseOutput, StepData
+from srm_mbs.integration.generated.code import loaded_code
 from srm_mbs.integration.kernel import marshalling
+from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import CompiledObservables
 from srm_mbs.integration.kernel.system import make_kernel_system, shared, workspace
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -27,11 +29,16 @@ def dense_output(
     made_by
         Backend of the run.
     """
-    if made_by == "kernel" and core is not None:
-        return CompiledDenseOutput(
-            None if shared(system) else make_kernel_system(system), system, scheme, steps
-        )
+    if made_by in COMPILED and core is not None:
+        code = code_for(made_by, system)
+        own = None if shared(system) else make_kernel_system(system, code)
+        return CompiledDenseOutput(own, system, scheme, steps, made_by=made_by)
     return DenseOutput(system, scheme, steps)
+
+
+def code_for(made_by: str, system: ClosedSystem | OpenSystem) -> Any:
+    """The generated code of a run, if it made the run in this process."""
+    return loaded_code(system.mechanism) if made_by == "generated" else None
 
 
 class CompiledDenseOutput(DenseOutput):
@@ -44,6 +51,8 @@ class CompiledDenseOutput(DenseOutput):
         (:func:`~srm_mbs.integration.kernel.system.shared`), so that results hold no workspace.
     system, scheme, steps, end_state
         As for :class:`~srm_mbs.integration.dense_output.DenseOutput`.
+    made_by
+        Backend of the run.
     """
 
     def __init__(
@@ -53,14 +62,16 @@ class CompiledDenseOutput(DenseOutput):
         scheme: ButcherTableau,
         steps: StepData,
         end_state: FloatArray | None = None,
+        made_by: str = "kernel",
     ) -> None:
         super().__init__(system, scheme, steps, end_state)
+        self._made_by = made_by
         self._mechanism_system = system
         self.kernel_system = kernel_system
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy may be loaded where there is no kernel.
-        return dense_output, (self._mechanism_system, self._scheme, self._steps, "kernel")
+        return dense_output, (self._mechanism_system, self._scheme, self._steps, self._made_by)
 
     @cached_property
     def observables(self) -> CompiledObservables:
@@ -75,7 +86,8 @@ class CompiledDenseOutput(DenseOutput):
         try:
             if self.kernel_system is not None:
                 return self._states(self.kernel_system, t)
-            with workspace(self._mechanism_system) as kernel_system:
+            code = code_for(self._made_by, self._mechanism_system)
+            with workspace(self._mechanism_system, code) as kernel_system:
                 return self._states(kernel_system, t)
         except ArithmeticError:
             return super().__call__(t)  # raises the error that says why

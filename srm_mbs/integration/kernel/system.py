@@ -22,8 +22,15 @@ LARGEST_KEPT = 64
 """Coordinates of a mechanism that keeps any: one takes 1.7 MB there."""
 
 
-def make_kernel_system(system: ClosedSystem | OpenSystem) -> Any:
-    """The mechanism of ``system`` in the kernel, with a workspace of its own."""
+def make_kernel_system(system: ClosedSystem | OpenSystem, code: Any = None) -> Any:
+    """The mechanism of ``system`` in the kernel, with a workspace of its own.
+
+    Parameters
+    ----------
+    code
+        Generated code that computes its terms
+        (:func:`~srm_mbs.integration.generated.code.load_code`); None: a pass over the tree does.
+    """
     held = system.held
     calls = system.has_user_forces or (system.controlled and held is None)
     controller = system.callback_force if calls else None
@@ -32,6 +39,7 @@ def make_kernel_system(system: ClosedSystem | OpenSystem) -> Any:
     if held is not None:
         for t, force in zip(held.times, held.values):
             kernel_system.hold(t, force, True)
+    kernel_system.use_code(code)
     return kernel_system
 
 
@@ -52,8 +60,9 @@ def idle_workspaces(mechanism: MechanismData) -> deque[Any]:
 
 
 @contextmanager
-def workspace(system: ClosedSystem | OpenSystem) -> Iterator[Any]:
-    """A kernel system of ``system`` for one user: an idle one of its mechanism, or a new one.
+def workspace(system: ClosedSystem | OpenSystem, code: Any = None) -> Iterator[Any]:
+    """A kernel system of ``system`` for one user: an idle one of its mechanism, or a new one;
+    ``code`` as for :func:`make_kernel_system`.
 
     It returns to the pool afterwards, if it is :func:`shared` and there are not KEPT already.  One
     whose user raised is left to the garbage collector.
@@ -64,7 +73,7 @@ def workspace(system: ClosedSystem | OpenSystem) -> Iterator[Any]:
     """
     core.enter_python()  # type: ignore[union-attr]
     try:
-        kernel_system = _idle_or_new(system)
+        kernel_system = _idle_or_new(system, code)
         yield kernel_system
         if shared(system):
             idle_workspaces(system.mechanism).append(kernel_system)
@@ -72,13 +81,14 @@ def workspace(system: ClosedSystem | OpenSystem) -> Iterator[Any]:
         core.leave_python()  # type: ignore[union-attr]
 
 
-def _idle_or_new(system: ClosedSystem | OpenSystem) -> Any:
+def _idle_or_new(system: ClosedSystem | OpenSystem, code: Any) -> Any:
     if shared(system):
         with suppress(IndexError):  # deque: two threads never get the same
             kernel_system = idle_workspaces(system.mechanism).pop()
             kernel_system.renew(**system.constants_of_start())
+            kernel_system.use_code(code)
             return kernel_system
-    return make_kernel_system(system)
+    return make_kernel_system(system, code)
 
 
 class _KernelTerms:

@@ -1,0 +1,54 @@
+#include "generated.hpp"
+
+#include <dlfcn.h>
+
+#include <stdexcept>
+
+namespace srm {
+
+namespace {
+
+constexpr int interface_version = 1;  // ABI in integration/generated/terms.py
+
+// Places in srm_mbs_sizes.
+enum Size { version, coordinates, rates, rows_of, rank_of, parameters_of, constants_of, laws_of, bodies_of };
+
+}  // namespace
+
+GeneratedTerms::GeneratedTerms(const std::string& path, const std::vector<double>& parameters) {
+    void* const handle = dlopen(path.c_str(), RTLD_NOW | RTLD_LOCAL);
+    if (!handle) throw std::invalid_argument(dlerror());
+    library_.reset(handle, dlclose);
+    const auto find = [&](const char* name) {
+        void* const found = dlsym(handle, name);
+        if (!found) throw std::invalid_argument(path + " has no " + name);
+        return found;
+    };
+    sizes_ = static_cast<const int*>(find("srm_mbs_sizes"));
+    if (sizes_[version] != interface_version)
+        throw std::invalid_argument(path + " has another interface");
+    terms_ = reinterpret_cast<Terms*>(find("srm_mbs_terms"));
+    set_constants_ = reinterpret_cast<Constants*>(find("srm_mbs_constants"));
+    factor_ = reinterpret_cast<Factor*>(dlsym(handle, "srm_mbs_factor"));
+    set_parameters(parameters);
+}
+
+GeneratedTerms::GeneratedTerms(const GeneratedTerms& other, const std::vector<double>& parameters)
+    : GeneratedTerms(other) {
+    set_parameters(parameters);
+}
+
+void GeneratedTerms::set_parameters(const std::vector<double>& parameters) {
+    if (static_cast<std::size_t>(sizes_[parameters_of]) != parameters.size())
+        throw std::invalid_argument("the generated code has another number of parameters");
+    constants_.resize(static_cast<std::size_t>(sizes_[constants_of]));
+    set_constants_(parameters.data(), constants_.data());
+}
+
+void GeneratedTerms::check(int nq, int nv, int rows, int rank, int laws, int bodies) const {
+    if (sizes_[coordinates] != nq || sizes_[rates] != nv || sizes_[rows_of] != rows ||
+        sizes_[rank_of] != rank || sizes_[laws_of] != laws || sizes_[bodies_of] != bodies)
+        throw std::invalid_argument("the code was generated for a system of another size");
+}
+
+}  // namespace srm

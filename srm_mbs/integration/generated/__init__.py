@@ -1,0 +1,1 @@
+"""Terms of one mechanism as C: recorded, compiled, cached and handed to the kernel."""

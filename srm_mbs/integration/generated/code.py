@@ -1,0 +1,207 @@
+"""The generated code of a mechanism: made once, shared by mechanisms of one structure.
+
+:func:`load_code` gives the kernel's ``GeneratedTerms`` of a mechanism, from this process, from the
+cache of the user, or newly compiled.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from pathlib import Path
+from threading import Lock
+from typing import Any, NamedTuple
+
+from srm_mbs._kernel import core
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.errors import InputError, get_logger
+from srm_mbs.integration.generated.code_cache import CompilationError, Compiled, compile_and_load
+from srm_mbs.integration.generated.structure import (
+    Structure,
+    UnsupportedElementError,
+    structure_of,
+)
+from srm_mbs.integration.generated.terms import Source, source_of
+from srm_mbs.model.mechanism import MechanismData, per_model
+
+log = get_logger(__name__)
+
+MOST_OPERATIONS = 40_000
+"""Statements of generated code: compilation takes about 0.15 ms each, and more for each the more
+there are."""
+KEPT = 256
+"""Structures whose code a process keeps."""
+
+
+class CompiledMechanism(NamedTuple):
+    """Generated code of a mechanism.
+
+    Attributes
+    ----------
+    operations
+        Statements of one evaluation.
+    seconds
+        Time (s) that compilation took; 0 if the code was there.
+    path
+        Where it lies in the cache of the user; None if it could not be kept.
+    source
+        Its C.
+    """
+
+    operations: int
+    seconds: float
+    path: Path | None
+    source: str
+
+    def __repr__(self) -> str:
+        made = f"compiled in {self.seconds:.2f} s" if self.seconds else "found"
+        return f"CompiledMechanism({self.operations} operations, {made})"
+
+
+class _Library(NamedTuple):
+    """The code of a structure in this process."""
+
+    source: Source
+    terms: Any
+    """A ``GeneratedTerms``; others are made from it."""
+    compiled: Compiled
+
+
+_libraries: OrderedDict[Structure, _Library] = OrderedDict()
+_lock = Lock()
+
+
+@per_model
+def _loaded(mechanism: MechanismData) -> deque[Any]:
+    """The ``GeneratedTerms`` of a mechanism, once it was asked for."""
+    return deque(maxlen=1)
+
+
+def loaded_code(mechanism: Mechanism) -> Any:
+    """The ``GeneratedTerms`` of a mechanism, if :func:`load_code` made them in this process; else
+    None."""
+    found = _loaded(mechanism)
+    return found[0] if found else None
+
+
+def load_code(mechanism: Mechanism) -> Any:
+    """The ``GeneratedTerms`` of a mechanism.
+
+    Raises
+    ------
+    InputError
+        If its code cannot be generated or compiled.
+    """
+    found = loaded_code(mechanism)
+    if found is None:
+        structure, parameters = _structure(mechanism)
+        found = _library(structure, parameters).terms.with_parameters(parameters)
+        _loaded(mechanism).append(found)
+    return found
+
+
+def code_of_run(by: str, asked: str, mechanism: Mechanism) -> tuple[str, Any]:
+    """Backend of a run of ``mechanism``, and its ``GeneratedTerms`` or None.
+
+    Parameters
+    ----------
+    by
+        From :func:`~srm_mbs.integration.kernel.backend.chosen_backend`.
+    asked
+        The option ``backend``: with ``"auto"``, the kernel runs where there is no code.
+
+    Raises
+    ------
+    InputError
+        If generated code is insisted on and cannot be made.
+    """
+    if by != "generated":
+        return by, None
+    try:
+        return by, load_code(mechanism)
+    except InputError as error:
+        if asked != "auto":
+            raise
+        log.info("the kernel makes this run without generated code: %s", error)
+        return "kernel", None
+
+
+def compile_mechanism(mechanism: Mechanism) -> CompiledMechanism:
+    """Load the code of a mechanism, and say how it was made; raises as :func:`load_code`."""
+    structure, parameters = _structure(mechanism)
+    known = structure in _libraries
+    library = _library(structure, parameters)
+    load_code(mechanism)
+    seconds = 0.0 if known else library.compiled.seconds
+    source = library.source
+    return CompiledMechanism(source.operations, seconds, library.compiled.path, source.text)
+
+
+def generated_source(mechanism: Mechanism) -> str:
+    """The C of a mechanism, which need not be compiled.
+
+    Raises
+    ------
+    InputError
+        If it cannot be generated.
+    """
+    return _source(_structure(mechanism)[0]).text
+
+
+def _structure(mechanism: Mechanism) -> tuple[Structure, FloatArray]:
+    try:
+        return structure_of(mechanism.model, make_system(mechanism).constants())
+    except UnsupportedElementError as error:
+        raise _not_generated(str(error)) from error
+
+
+def _not_generated(why: str) -> InputError:
+    return InputError(
+        f"no code can be generated for this mechanism: {why}",
+        element="backend",
+        remedy="Use the backend kernel",
+    )
+
+
+def _source(structure: Structure) -> Source:
+    try:
+        source = source_of(structure)
+    except UnsupportedElementError as error:
+        raise _not_generated(str(error)) from error
+    if source.operations > MOST_OPERATIONS:
+        raise _not_generated(
+            f"it would have {source.operations} statements, more than {MOST_OPERATIONS}"
+        )
+    return source
+
+
+def _library(structure: Structure, parameters: FloatArray) -> _Library:
+    """The code of a structure; ``parameters`` are those of one mechanism of it."""
+    if core is None:
+        raise InputError(
+            "generated code needs the compiled kernel, which is not available",
+            element="backend",
+            remedy="Use the backend auto",
+        )
+    with _lock:
+        found = _libraries.get(structure)
+        if found is not None:
+            _libraries.move_to_end(structure)
+            return found
+    source = _source(structure)
+    try:
+        terms, compiled = compile_and_load(
+            source.text, lambda path: core.GeneratedTerms(str(path), parameters)
+        )
+    except CompilationError as error:
+        raise InputError(
+            f"the generated code cannot be compiled: {error}",
+            element="backend",
+            remedy=f"{error.remedy}, or use the backend kernel",
+        ) from error
+    with _lock:
+        _libraries[structure] = library = _Library(source, terms, compiled)
+        while len(_libraries) > KEPT:
+            _libraries.popitem(last=False)
+    return library

@@ -1,0 +1,427 @@
+"""The structure of a mechanism, on which its generated code depends, and the numbers in it.
+
+:func:`structure_of` splits the constants of a system into a :class:`Structure`, which is hashable,
+and a vector of parameters.  The structure knows of each number only whether it is 0 or not and,
+where it is a sign or part of a direction, whether it is 1 or -1, so that mechanisms of one topology
+share one function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.model.model_data import joint_type_data
+
+ROUNDING = 2.0**-52
+"""Part of a rotation's unit, or of a body's moments, that is rounding."""
+ZERO, ONE, MINUS_ONE, OTHER = range(4)
+"""Codes of numbers."""
+
+
+class Span(NamedTuple):
+    """Consecutive numbers of the vector of parameters."""
+
+    start: int
+    length: int
+
+
+class Motion(NamedTuple):
+    """A joint of one of the elementary kinds, with its body.
+
+    Attributes
+    ----------
+    kind
+        ``revolute``, ``unbounded``, ``prismatic``, ``helical``, ``free``, ``planar``,
+        ``spherical`` or ``translation``.
+    parent
+        Number of the motion before it in the tree; -1 for the ground.
+    in_q, in_v
+        Its first places in q and v.
+    axis, pitch, placement
+        Unit axis (3) and pitch (m/rad) of the kinds that have them; rotation, row by row, and
+        translation (12) from the parent.
+    inertia
+        Mass, centre of mass (3), moments about it (6: xx, xy, xz, yy, yz, zz), in its own axes.
+    """
+
+    kind: str
+    parent: int
+    in_q: int
+    in_v: int
+    axis: Span
+    pitch: Span
+    placement: Span
+    inertia: Span
+
+
+class Closure(NamedTuple):
+    """The rows of a closure: ``ClosureRows`` of system.hpp; ``support`` has pairs of column and
+    sign."""
+
+    joint_a: int
+    joint_b: int
+    first_row: int
+    at_a: Span
+    at_b: Span
+    directions: Span
+    distances: Span
+    alignments: Span
+    support: tuple[tuple[int, int], ...]
+
+
+class CoordinateRow(NamedTuple):
+    """``JointRow`` of system.hpp."""
+
+    row: int
+    in_q: tuple[int, ...]
+    in_v: tuple[int, ...]
+    coefficients: Span
+    offset: Span
+    arguments: Span
+    powers: Span
+
+
+class Subtraction(NamedTuple):
+    """``Elimination`` of system.hpp."""
+
+    row: int
+    other: int
+    factor: Span
+    columns: tuple[int, ...]
+
+
+class Force(NamedTuple):
+    """``ForceElement`` of forces.hpp.
+
+    Attributes
+    ----------
+    factors
+        ``signs`` of the columns.
+    coefficients
+        Stiffness, damping and rest (3).
+    laws
+        Number of the first curve of its numbers among those of the mechanism, and their count.
+    """
+
+    kind: int
+    joint_a: int
+    joint_b: int
+    at_a: Span
+    at_b: Span
+    columns: tuple[int, ...]
+    factors: Span
+    positions: tuple[int, ...]
+    coefficients: Span
+    in_q: int
+    in_v: int
+    in_link_axes: bool
+    numbers: Span
+    laws: Span
+
+
+class Structure(NamedTuple):
+    """All of it.
+
+    Attributes
+    ----------
+    codes
+        ZERO, ONE, MINUS_ONE or OTHER for each number of the vector of parameters.
+    bodies
+        Number of the motion that carries the body of each joint of the model; -1 for the ground.
+    bushing_joints, bushing_columns
+        Joints of the bodies between which bushings act, without the ground, and rates that move
+        them.
+    """
+
+    nq: int
+    nv: int
+    rows: int
+    rank: int
+    gravity: Span
+    armature: Span
+    coincident: Span
+    motions: tuple[Motion, ...]
+    bodies: tuple[int, ...]
+    closures: tuple[Closure, ...]
+    coordinate_rows: tuple[CoordinateRow, ...]
+    subtractions: tuple[Subtraction, ...]
+    forces: tuple[Force, ...]
+    bushing_joints: tuple[int, ...]
+    bushing_columns: tuple[int, ...]
+    codes: bytes
+
+
+class UnsupportedElementError(Exception):
+    """The mechanism has an element that is not generated; the message names it as a clause."""
+
+
+_AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
+_ALIGNED = {"R": "revolute", "RUB": "unbounded", "P": "prismatic", "H": "helical"}
+_UNALIGNED = {
+    "RevoluteUnaligned": "revolute",
+    "RevoluteUnboundedUnaligned": "unbounded",
+    "PrismaticUnaligned": "prismatic",
+    "HelicalUnaligned": "helical",
+}
+_WHOLE = {
+    "FreeFlyer": "free",
+    "Planar": "planar",
+    "Spherical": "spherical",
+    "Translation": "translation",
+}
+_SIZES = {"free": (7, 6), "planar": (4, 3), "spherical": (4, 3), "translation": (3, 3)}
+"""Numbers of coordinates and of rates of the kinds that have more than one rate."""
+_NO_PLACEMENT = (*np.eye(3).ravel().tolist(), 0.0, 0.0, 0.0)
+
+
+class _Part(NamedTuple):
+    """An elementary motion of a joint, before its body."""
+
+    kind: str
+    axis: Sequence[float]
+    pitch: Sequence[float]
+    placement: Sequence[float]
+
+
+def _parts(kind: Mapping[str, Any], name: str, placement: Sequence[float]) -> list[_Part]:
+    """A joint, as :class:`~srm_mbs.model.model_data.JointTypeData` has it, as elementary ones."""
+    own: str = kind["type"]
+    if own in _WHOLE:
+        return [_Part(_WHOLE[own], (), (), placement)]
+    if own in _UNALIGNED:
+        return [_Part(_UNALIGNED[own], kind["axes"][0], kind.get("numbers", ()), placement)]
+    if own[:-1] in _ALIGNED and own[-1] in _AXES:
+        return [_Part(_ALIGNED[own[:-1]], _AXES[own[-1]], kind.get("numbers", ()), placement)]
+    if own == "Universal":
+        first, second = kind["axes"]
+        return [
+            _Part("revolute", first, (), placement),
+            _Part("revolute", second, (), _NO_PLACEMENT),
+        ]
+    if own == "SphericalZYX":
+        return [
+            _Part("revolute", _AXES[letter], (), placement if letter == "Z" else _NO_PLACEMENT)
+            for letter in "ZYX"
+        ]
+    if own == "Composite":
+        out = []
+        for i, part in enumerate(kind["parts"]):
+            at = _product(placement, part["placement"]) if i == 0 else part["placement"]
+            out += _parts(part["kind"], name, at)
+        return out
+    raise UnsupportedElementError(f"the joint {name!r} is of the type {own}")
+
+
+def _product(first: Sequence[float], second: Sequence[float]) -> list[float]:
+    """Two placements one after the other."""
+    a, b = np.asarray(first), np.asarray(second)
+    R = a[:9].reshape(3, 3)
+    rotation = R @ b[:9].reshape(3, 3)
+    return [*rotation.ravel().tolist(), *(a[9:] + R @ b[9:]).tolist()]
+
+
+class _Numbers:
+    """Collects the parameters."""
+
+    def __init__(self) -> None:
+        self.values: list[float] = []
+        self.units: list[Span] = []
+        """Those among which 1 and -1 are no sizes, but signs or directions."""
+
+    def take(self, values: Any, units: bool = False) -> Span:
+        """Append ``values``."""
+        span = Span(len(self.values), len(values))
+        self.values.extend(values)
+        if units:
+            self.units.append(span)
+        return span
+
+    def codes(self) -> bytes:
+        """The code of each number."""
+        values = np.array(self.values, dtype=float)
+        out = np.where(values == 0.0, ZERO, OTHER).astype(np.uint8)
+        for start, count in self.units:
+            own = slice(start, start + count)
+            out[own][values[own] == 1.0] = ONE
+            out[own][values[own] == -1.0] = MINUS_ONE
+        return out.tobytes()
+
+    def rotated(self, placement: Sequence[float]) -> Span:
+        """Append a placement (12); of its rotation, what is rounding is left out."""
+        span = self.take([_rounded(x) for x in placement[:9]], units=True)
+        return Span(span.start, span.length + self.take(placement[9:]).length)
+
+
+def _rounded(x: float) -> float:
+    """An entry of a rotation without what is rounding of 0, 1 or -1."""
+    nearest = round(x)
+    return float(nearest) if abs(x - nearest) <= ROUNDING else float(x)
+
+
+def _inertia(body: pin.Inertia) -> list[float]:
+    moments = body.inertia[np.triu_indices(3)]
+    moments[np.abs(moments) <= ROUNDING * np.abs(moments).max()] = 0.0
+    tensor: list[float] = moments.tolist()
+    if body.mass == 0.0:
+        return [*[0.0] * 4, *tensor]
+    return [float(body.mass), *body.lever.tolist(), *tensor]
+
+
+def _signs(support: FloatArray) -> tuple[tuple[int, int], ...]:
+    return tuple((int(j), int(support[j])) for j in np.flatnonzero(support))
+
+
+BUSHING = 4
+"""The kind of bushings among those of forces.hpp: the kernel evaluates them, because their moments
+depend on the step."""
+_NO_ANCHOR = (0, np.array(_NO_PLACEMENT))
+
+
+def structure_of(model: pin.Model, constants: Mapping[str, Any]) -> tuple[Structure, FloatArray]:
+    """Structure and parameters of a system.
+
+    Parameters
+    ----------
+    model
+        Its tree.
+    constants
+        From :meth:`~srm_mbs.dynamics.multibody.Mechanics.constants`.
+
+    Raises
+    ------
+    UnsupportedElementError
+        If no code can be generated for an element.
+    """
+    numbers = _Numbers()
+    if len(model.mimicking_joints):
+        raise UnsupportedElementError("the model has mimic joints")
+    motions, bodies = _tree(model, numbers)
+    fields: dict[str, Any] = {
+        "nq": int(model.nq),
+        "nv": int(model.nv),
+        "rows": int(constants["rows"]),
+        "rank": int(constants["structural_rank"]),
+        "gravity": numbers.take(model.gravity.vector.tolist()),
+        "armature": numbers.take(model.armature.tolist()),
+        "coincident": numbers.take([float(constants["coincident"])]),
+        "motions": motions,
+        "bodies": bodies,
+        "closures": tuple(_closure(numbers, **rows) for rows in constants["loops"]),
+        "coordinate_rows": tuple(_row(numbers, **row) for row in constants["joint_rows"]),
+        "subtractions": tuple(
+            Subtraction(row, other, numbers.take([factor]), tuple(columns))
+            for row, other, factor, columns in constants["eliminations"]
+        ),
+        "forces": _forces(numbers, constants["forces"]),
+    }
+    bushings = [force for force in constants["forces"] if force["kind"] == BUSHING]
+    joints = [int(force[end][0]) for force in bushings for end in ("a", "b")]
+    columns = {int(j) for force in bushings for j in np.flatnonzero(force["support"])}
+    # In the order in which they are met, as generated.cpp's caller has them.
+    fields["bushing_joints"] = tuple(dict.fromkeys(joint for joint in joints if joint))
+    fields["bushing_columns"] = tuple(sorted(columns))
+    return Structure(codes=numbers.codes(), **fields), np.array(numbers.values, dtype=float)
+
+
+def _tree(model: pin.Model, numbers: _Numbers) -> tuple[tuple[Motion, ...], tuple[int, ...]]:
+    motions: list[Motion] = []
+    bodies = [-1]
+    massless = [0.0] * 10
+    for i in range(1, model.njoints):
+        joint, at = model.joints[i], model.jointPlacements[i]
+        placement = [*at.rotation.ravel().tolist(), *at.translation.tolist()]
+        parts = _parts(joint_type_data(joint), model.names[i], placement)
+        parent, in_q, in_v = bodies[int(model.parents[i])], int(joint.idx_q), int(joint.idx_v)
+        for part in parts:
+            own = _inertia(model.inertias[i]) if part is parts[-1] else massless
+            spans = numbers.take(part.axis, units=True), numbers.take(part.pitch)
+            placed = numbers.rotated(part.placement)
+            motions.append(Motion(part.kind, parent, in_q, in_v, *spans, placed, numbers.take(own)))
+            parent = len(motions) - 1
+            nq, nv = _SIZES.get(part.kind, (2 if part.kind == "unbounded" else 1, 1))
+            in_q, in_v = in_q + nq, in_v + nv
+        bodies.append(parent)
+    return tuple(motions), tuple(bodies)
+
+
+def _closure(
+    numbers: _Numbers,
+    joint_a: int,
+    joint_b: int,
+    first_row: int,
+    support: FloatArray,
+    at_a: FloatArray,
+    at_b: FloatArray,
+    directions: FloatArray,
+    distances: FloatArray,
+    alignments: FloatArray,
+) -> Closure:
+    return Closure(
+        joint_a,
+        joint_b,
+        first_row,
+        numbers.take(at_a.tolist()),
+        numbers.take(at_b.tolist()),
+        numbers.take(directions.tolist(), units=True),
+        numbers.take(distances.tolist(), units=True),
+        numbers.take(alignments.tolist(), units=True),
+        _signs(support),
+    )
+
+
+def _row(
+    numbers: _Numbers,
+    row: int,
+    in_q: Sequence[int],
+    in_v: Sequence[int],
+    coefficients: FloatArray,
+    offset: float,
+    arguments: FloatArray,
+    powers: FloatArray,
+) -> CoordinateRow:
+    return CoordinateRow(
+        row,
+        tuple(in_q),
+        tuple(in_v),
+        numbers.take(coefficients.tolist(), units=True),
+        numbers.take([offset]),
+        numbers.take(arguments.tolist(), units=True),
+        numbers.take(powers.tolist()),
+    )
+
+
+def _forces(numbers: _Numbers, forces: Sequence[Mapping[str, Any]]) -> tuple[Force, ...]:
+    out = []
+    laws = 0
+    for force in forces:
+        if force["kind"] == BUSHING:
+            continue
+        a, b = force.get("a", _NO_ANCHOR), force.get("b", _NO_ANCHOR)
+        support = np.asarray(force.get("support", ()), dtype=float)
+        columns = np.flatnonzero(support)
+        curves = len(force.get("curves", ()))
+        out.append(
+            Force(
+                force["kind"],
+                int(a[0]),
+                int(b[0]),
+                numbers.rotated(a[1].tolist()),
+                numbers.rotated(b[1].tolist()),
+                tuple(columns.tolist()),
+                numbers.take(support[columns].tolist(), units=True),
+                tuple(force.get("positions", ())),
+                numbers.take([force.get(key, 0.0) for key in ("stiffness", "damping", "rest")]),
+                force.get("in_q", 0),
+                force.get("in_v", 0),
+                bool(force.get("turns", False)),
+                numbers.take(np.asarray(force.get("numbers", ())).tolist()),
+                Span(laws, curves),
+            )
+        )
+        laws += curves
+    return tuple(out)

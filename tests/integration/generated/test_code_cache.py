@@ -1,0 +1,226 @@
+"""The cache of compiled code: private, whole, bounded; and compilers that fail."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import srm_mbs as srm
+from srm_mbs.integration.generated import code_cache
+from srm_mbs.integration.generated.code_cache import CompilationError, compile_and_load
+from srm_mbs.integration.kernel import backend
+from tests.support.commands import row, run
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+
+SEVEN = "int seven(void) { return 7; }\n"
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The cache of a test; its folder does not exist at first."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "srm-mbs" / "code"
+
+
+@pytest.fixture
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that is the C compiler, to be written."""
+    path = tmp_path / "compiler"
+    monkeypatch.setenv("CC", str(path))
+    monkeypatch.setattr(code_cache, "compiler", code_cache.compiler.__wrapped__)
+    return path
+
+
+def _write_program(path: Path, script: str) -> None:
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o700)
+
+
+def _seven(path: Path) -> int:
+    try:
+        return int(ctypes.CDLL(str(path)).seven())
+    except OSError as error:
+        raise ValueError(str(error)) from error
+
+
+def test_code_is_compiled_once_and_then_found(folder: Path) -> None:
+    value, first = compile_and_load(SEVEN, _seven)
+    assert (value, first.seconds > 0.0) == (7, True)
+    assert first.path is not None
+    assert first.path.parent == folder
+    value, second = compile_and_load(SEVEN, _seven)
+    assert (value, second.seconds, second.path) == (7, 0.0, first.path)
+    assert code_cache.contents()[0] == 1
+
+
+def test_the_cache_is_the_users_alone(folder: Path) -> None:
+    compile_and_load(SEVEN, _seven)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert {stat.S_IMODE(path.stat().st_mode) & 0o077 for path in folder.iterdir()} == {0}
+    assert not [path for path in folder.iterdir() if path.name.startswith("new-")]
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o750, 0o702])
+def test_code_is_not_read_from_a_folder_that_is_open_to_others(folder: Path, mode: int) -> None:
+    compile_and_load(SEVEN, _seven)
+    folder.chmod(mode)
+    value, made = compile_and_load(SEVEN, _seven)
+    assert value == 7
+    assert made.seconds > 0.0
+    assert made.path is None
+
+
+def test_a_folder_of_another_user_or_a_link_is_unsafe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = tmp_path / "own"
+    own.mkdir(mode=0o700)
+    assert code_cache.unsafe_reason(own) is None
+    link = tmp_path / "link"
+    link.symlink_to(own)
+    assert "is no folder" in str(code_cache.unsafe_reason(link))
+    uid = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: uid + 1)
+    assert "belongs to another user" in str(code_cache.unsafe_reason(own))
+
+
+@pytest.mark.parametrize("damage", ["truncated", "changed", "empty", "no digest"])
+def test_a_damaged_library_is_compiled_again(folder: Path, damage: str) -> None:
+    path = compile_and_load(SEVEN, _seven)[1].path
+    assert path is not None
+    content = path.read_bytes()
+    path.write_bytes(
+        {
+            "truncated": content[: len(content) // 2],
+            "changed": content[:-1] + bytes([content[-1] ^ 1]),
+            "empty": b"",
+        }.get(damage, content)
+    )
+    if damage == "no digest":
+        path.with_suffix(".sha256").unlink()
+    value, made = compile_and_load(SEVEN, _seven)
+    assert (value, made.seconds > 0.0) == (7, True)
+    assert path.read_bytes() != b""
+    assert compile_and_load(SEVEN, _seven)[1].seconds == 0.0
+
+
+def test_without_a_place_for_the_cache_code_is_compiled_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    occupied = tmp_path / "file"
+    occupied.write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(occupied))
+    value, made = compile_and_load(SEVEN, _seven)
+    assert (value, made.path) == (7, None)
+
+
+def test_a_full_disk_leaves_nothing_half_written(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    value, made = compile_and_load(SEVEN, _seven)
+    assert (value, made.path) == (7, None)
+    assert not list(folder.iterdir())
+
+
+def test_the_cache_keeps_what_was_used_last(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sources = [f"int seven(void) {{ return 7 + {i} * 0; }}\n" for i in range(3)]
+    first = compile_and_load(sources[0], _seven)[1].path
+    second = compile_and_load(sources[1], _seven)[1].path
+    assert first is not None
+    assert second is not None
+    now = time.time()
+    os.utime(second, (now - 50.0, now - 50.0))
+    os.utime(first, (now - 100.0, now - 100.0))
+    compile_and_load(sources[0], _seven)  # used again
+    monkeypatch.setattr(code_cache, "LARGEST", int(2.5 * first.stat().st_size))
+    compile_and_load(sources[2], _seven)
+    assert first.exists()
+    assert not second.exists()
+    assert not second.with_suffix(".sha256").exists()
+
+
+def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(code_cache, "compiler", code_cache.compiler.__wrapped__)
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(CompilationError, match="there is no C compiler"):
+        compile_and_load(SEVEN, _seven)
+
+
+def test_the_last_line_of_a_compiler_that_fails_is_the_reason(program: Path) -> None:
+    _write_program(program, "echo first >&2; echo cannot do it >&2; exit 3")
+    with pytest.raises(CompilationError, match=r"compiler failed: cannot do it"):
+        compile_and_load(SEVEN, _seven)
+
+
+def test_a_compiler_that_makes_nothing_has_failed(program: Path) -> None:
+    _write_program(program, "exit 0")
+    with pytest.raises(CompilationError, match="failed: no message"):
+        compile_and_load(SEVEN, _seven)
+
+
+def test_a_compiler_that_makes_rubbish_has_failed(program: Path) -> None:
+    _write_program(program, 'while [ "$1" != -o ]; do shift; done; echo rubbish > "$2"')
+    with pytest.raises(CompilationError, match="cannot be loaded"):
+        compile_and_load(SEVEN, _seven)
+
+
+def test_a_compiler_that_hangs_is_ended_with_its_children(program: Path, tmp_path: Path) -> None:
+    mark = tmp_path / "child"
+    _write_program(program, f"(sleep 1.5; touch {mark}) & sleep 60")
+    started = time.perf_counter()
+    with pytest.raises(CompilationError, match=r"made nothing within 0\.3 s"):
+        compile_and_load(SEVEN, _seven, patience=0.3)
+    assert time.perf_counter() - started < 5.0
+    time.sleep(2.0)
+    assert not mark.exists()
+
+
+def test_another_compiler_does_not_take_the_code_of_the_first(program: Path) -> None:
+    real = shutil.which("cc")
+    _write_program(program, f'exec {real} "$@"')
+    assert compile_and_load(SEVEN, _seven)[1].seconds > 0.0
+    assert compile_and_load(SEVEN, _seven)[1].seconds == 0.0
+    _write_program(program, f'# another version\nexec {real} "$@"')
+    assert compile_and_load(SEVEN, _seven)[1].seconds > 0.0
+
+
+@pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}")
+def test_compile_says_how_it_was_made_and_cache_clears_it(folder: Path) -> None:
+    assert "operations, " in run("compile", "four_bar")
+    made = "import srm_mbs as srm; print(srm.compile(srm.load('four_bar')))"
+    apart = [
+        subprocess.run([sys.executable, "-c", made], capture_output=True, text=True, check=True)
+        for _ in range(2)
+    ]
+    assert "found" in apart[1].stdout
+    assert int(row(run("cache"), "compiled mechanisms")) >= 1
+    assert row(run("cache"), "folder") == str(folder)
+    run("cache", "--clear")
+    assert row(run("cache"), "compiled mechanisms") == "0"
+    assert not list(folder.iterdir())
+
+
+def test_source_is_printed_and_not_compiled(folder: Path) -> None:
+    source = run("compile", "four_bar", "--source")
+    assert "int srm_mbs_terms(" in source
+    assert "sin(q[0])" in source
+    assert not folder.exists()
+
+
+def test_wrong_arguments_of_compile_are_refused() -> None:
+    with pytest.raises(srm.InputError, match="Mechanism"):
+        srm.compile("four_bar")  # type: ignore[arg-type]

@@ -1,0 +1,262 @@
+"""Generated code computes what Pinocchio, the reference and the kernel compute."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import srm_mbs as srm
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.integration.generated.code import load_code
+from srm_mbs.integration.generated.structure import UnsupportedElementError, structure_of
+from srm_mbs.integration.kernel import backend
+from srm_mbs.integration.kernel.system import make_kernel_system
+from tests.support.bundled import load
+from tests.support.dynamics import mass_matrix, nonlinear_effects
+from tests.support.generated import GeneratedFunction
+from tests.support.mechanisms import along_x, rod
+
+pytestmark = [
+    pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}"),
+    pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler"),
+]
+
+_TILTED = np.array([0.6, 0.0, 0.8])
+_OTHER = np.array([0.0, -0.8, 0.6])
+
+
+def _composite() -> pin.JointModelComposite:
+    joint = pin.JointModelComposite()
+    joint.addJoint(pin.JointModelRX(), along_x(0.2))
+    joint.addJoint(pin.JointModelPY(), along_x(0.1))
+    joint.addJoint(pin.JointModelUniversal(_TILTED, _OTHER), along_x(-0.3))
+    return joint
+
+
+def _tilted_unbounded() -> object:
+    """Pinocchio's class has no constructor with an axis; its reader of URDF has."""
+    return pin.buildModelFromXML(
+        '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">'
+        '<parent link="a"/><child link="b"/><axis xyz="0.6 0 0.8"/></joint></robot>'
+    ).joints[1]
+
+
+JOINTS: dict[str, Callable[[], object]] = {
+    **{
+        name: getattr(pin, f"JointModel{name}")
+        for name in (
+            *("RX", "RY", "RZ", "RUBX", "RUBY", "RUBZ", "PX", "PY", "PZ"),
+            *("Spherical", "SphericalZYX", "Planar", "FreeFlyer", "Translation"),
+        )
+    },
+    "revolute": lambda: pin.JointModelRevoluteUnaligned(_TILTED),
+    "unbounded": _tilted_unbounded,
+    "prismatic": lambda: pin.JointModelPrismaticUnaligned(_TILTED),
+    "HX": lambda: pin.JointModelHX(0.2),
+    "HY": lambda: pin.JointModelHY(-0.2),
+    "HZ": lambda: pin.JointModelHZ(0.3),
+    "helical": lambda: pin.JointModelHelicalUnaligned(_TILTED, 0.2),
+    "universal": lambda: pin.JointModelUniversal(_TILTED, _OTHER),
+    "composite": _composite,
+}
+
+
+def _tree(make: Callable[[], object]) -> srm.Mechanism:
+    """A hinge, two joints of a kind after it, the second at an angle, and a second branch."""
+    rng = np.random.default_rng(3)
+    model = pin.Model()
+
+    def add(parent: int, joint: object, name: str) -> int:
+        placement = pin.SE3(pin.rpy.rpyToMatrix(rng.uniform(-1, 1, 3)), rng.uniform(-1, 1, 3))
+        index = model.addJoint(parent, joint, placement, name)
+        body = rod(rng.uniform(0.5, 2.0))
+        body.lever = rng.uniform(-0.5, 0.5, 3)
+        model.appendBodyToJoint(
+            index, body, pin.SE3(pin.rpy.rpyToMatrix(*rng.normal(size=3)), np.zeros(3))
+        )
+        model.addBodyFrame(name, index, pin.SE3.Identity(), 0)
+        return index
+
+    first = add(0, pin.JointModelRY(), "root")
+    last = add(add(first, make(), "one"), make(), "two")
+    add(last, pin.JointModelRZ(), "tip")
+    add(first, pin.JointModelRX(), "branch")
+    model.armature = rng.uniform(0.0, 0.1, model.nv)
+    model.gravity = pin.Motion(np.array([0.3, -1.0, -9.0, 0.0, 0.0, 0.0]))
+    return srm.Mechanism(model, q0=pin.neutral(model))
+
+
+def _states(mechanism: srm.Mechanism, count: int) -> list[tuple[FloatArray, FloatArray]]:
+    model, rng = mechanism.model, np.random.default_rng(4)
+    return [
+        (
+            pin.integrate(model, mechanism.q0, rng.uniform(-2.0, 2.0, model.nv)),
+            rng.uniform(-2.0, 2.0, model.nv),
+        )
+        for _ in range(count)
+    ]
+
+
+@pytest.mark.parametrize("name", JOINTS)
+def test_mass_matrix_and_nonlinear_effects_are_pinocchios_for_any_kind_of_joint(name: str) -> None:
+    mechanism = _tree(JOINTS[name])
+    function, model = GeneratedFunction(mechanism), mechanism.model
+    for q, v in _states(mechanism, 5):
+        found = function(q, v)
+        M, nle = mass_matrix(model, q), nonlinear_effects(model, q, v)
+        assert found.status == 0
+        assert np.abs(found.M - M).max() < 1e-14 * np.abs(M).max()
+        assert np.abs(found.nle - nle).max() < 2e-14 * np.abs(nle).max()
+
+
+CLOSURES = {
+    "point": {},
+    "frame": {},
+    "revolute": {"axis": (0.0, 0.6, 0.8)},
+    "prismatic": {"axis": (1.0, 0.0, 0.0)},
+    "cylindrical": {"axis": (0.6, 0.8, 0.0)},
+    "universal": {"axis_a": (0.0, 0.0, 1.0), "axis_b": (0.0, 0.6, 0.8)},
+    "planar": {"axis": (0.0, 0.0, 1.0)},
+    "point_on_line": {"axis": (0.0, 1.0, 0.0)},
+    "point_on_plane": {"axis": (0.6, 0.0, 0.8)},
+    "distance": {"length": 1.3},
+}
+
+
+def _ring(kind: str, ground: bool) -> srm.Mechanism:
+    """A chain of ball joints and a hinge whose end is tied to the ground or to its first body."""
+    rng = np.random.default_rng(5)
+    model = pin.Model()
+    joint = 0
+    for i in range(5):
+        at = pin.SE3(pin.rpy.rpyToMatrix(rng.uniform(-1, 1, 3)), rng.uniform(-1, 1, 3))
+        made = pin.JointModelRX() if i == 1 else pin.JointModelSpherical()
+        joint = model.addJoint(joint, made, at, f"j{i}")
+        model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
+        model.addBodyFrame(f"body_{i}", joint, pin.SE3.Identity(), 0)
+    a = srm.Anchor("body_4", xyz=(0.3, 0.1, -0.2), rpy=(0.1, 0.2, 0.3))
+    at_b = {"xyz": (0.2, -0.1, 0.4), "rpy": (-0.4, 0.2, 0.9)}
+    b = srm.Anchor("world" if ground else "body_0", **at_b)
+    loop = srm.LoopClosure(kind, a, b, **CLOSURES[kind])
+    return srm.Mechanism(model, [loop], q0=pin.neutral(model))
+
+
+@pytest.mark.parametrize("ground", [True, False])
+@pytest.mark.parametrize("kind", CLOSURES)
+def test_rows_of_closures_are_those_of_the_reference(kind: str, ground: bool) -> None:
+    mechanism = _ring(kind, ground)
+    system, function = make_system(mechanism), GeneratedFunction(mechanism)
+    for q, v in _states(mechanism, 5):
+        system.evaluate(0.0, np.concatenate([q, v]))
+        rows, found = system.loops, function(q, v)
+        for own, expected in ((found.g, rows.g), (found.G, rows.G), (found.bias, rows.bias)):
+            assert np.abs(own - expected).max() < 1e-13 * max(np.abs(expected).max(), 1.0)
+
+
+def _agree(mechanism: srm.Mechanism, count: int = 8) -> None:
+    """Assert that evaluations by generated code and by the kernel agree, next to start states."""
+    system = make_system(mechanism)
+    kernel, generated = make_kernel_system(system), make_kernel_system(system, load_code(mechanism))
+    for q, v in _states(mechanism, count):
+        state = np.concatenate([q, v])
+        a, b = kernel.terms(0.3, state), generated.terms(0.3, state)
+        assert a["rank"] == b["rank"]
+        # Accelerations of bodies that nearly lack inertia carry its condition number.
+        M = mass_matrix(mechanism.model, q)
+        allowed = max(1e-13 / min(a["sigma"], 1.0), 1e-16 * np.linalg.cond(M))
+        for key in ("rate", "correction", "multiplier", "sigma", "constraint_residual"):
+            size = np.abs(a[key]).max()
+            if np.isfinite(size):
+                assert np.abs(a[key] - b[key]).max() <= max(allowed, 1e-12) * max(size, 1e-3), key
+
+
+@pytest.mark.parametrize("name", srm.bundled_models())
+def test_evaluations_of_bundled_mechanisms_are_those_of_the_kernel(name: str) -> None:
+    _agree(load(name))
+
+
+FORCES = {
+    "spring": srm.SpringDamper(
+        srm.Anchor("body_4", xyz=(0.1, 0.2, 0.3)),
+        srm.Anchor("body_0", xyz=(0.3, 0.0, 0.1)),
+        stiffness=40.0,
+        damping=3.0,
+        rest_length=0.7,
+    ),
+    "spring without length": srm.SpringDamper(
+        srm.Anchor("body_4", xyz=(0.1, 0.2, 0.3)),
+        srm.Anchor("world"),
+        stiffness=40.0,
+        damping=3.0,
+        rest_length=0.0,
+    ),
+    "torque": srm.JointTorque("j1", 2.5),
+    "torque over time": srm.JointTorque("j1", 2.5, law=srm.Sine(1.0, frequency_hz=2.0)),
+    "torsion": srm.TorsionSpring("j1", stiffness=4.0, damping=0.3, rest_angle=0.2),
+    "limit": srm.LimitSpring("j1", lower=-0.3, upper=0.2, stiffness=50.0, damping=2.0, depth=0.4),
+    "wrench": srm.Wrench(srm.Anchor("body_3"), force=(1.0, 2.0, 3.0), moment=(0.0, -1.0, 2.0)),
+    "wrench of the link": srm.Wrench(
+        srm.Anchor("body_3", xyz=(0.1, 0.0, 0.0)),
+        force=(1.0, 2.0, 3.0),
+        moment=(0.5, -1.0, 2.0),
+        frame="link",
+        law=srm.Polynomial((1.0, 0.5)),
+    ),
+    "bushing": srm.Bushing(
+        srm.Anchor("body_4", xyz=(0.1, 0.2, 0.3)),
+        srm.Anchor("body_0", rpy=(0.3, 0.0, 0.1)),
+        stiffness=(10.0, 20.0, 30.0, 1.0, 2.0, 3.0),
+        damping=(1.0, 2.0, 3.0, 0.1, 0.2, 0.3),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FORCES)
+def test_forces_of_elements_are_those_of_the_kernel(name: str) -> None:
+    plain = _ring("point_on_plane", True)
+    with_force = srm.Mechanism(plain.model, plain.loops, q0=plain.q0, forces=[FORCES[name]])
+    _agree(with_force)
+    without = make_kernel_system(make_system(plain), load_code(plain))
+    with_it = make_kernel_system(make_system(with_force), load_code(with_force))
+    q, v = _states(plain, 1)[0]
+    state = np.concatenate([q, v])
+    one, two = (system.terms(0.3, state)["rate"] for system in (without, with_it))
+    assert np.abs(one - two).max() > 1e-3
+
+
+def test_points_of_a_rod_that_coincide_are_refused_as_by_the_kernel() -> None:
+    plain = _ring("distance", True)
+    hinge = tuple(plain.model.jointPlacements[2].translation.tolist())
+    spring = srm.SpringDamper(
+        srm.Anchor("body_1"), srm.Anchor("body_0", xyz=hinge), stiffness=1.0, rest_length=1.0
+    )
+    mechanism = srm.Mechanism(plain.model, plain.loops, q0=plain.q0, forces=[spring])
+    generated = make_kernel_system(make_system(mechanism), load_code(mechanism))
+    with pytest.raises(ArithmeticError):
+        generated.terms(0.0, np.concatenate([mechanism.q0, np.zeros(mechanism.model.nv)]))
+
+
+def test_an_ellipsoid_joint_is_named_as_the_reason() -> None:
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelEllipsoid(1.0, 2.0, 3.0), pin.SE3.Identity(), "egg")
+    model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
+    mechanism = srm.Mechanism(model, q0=pin.neutral(model))
+    with pytest.raises(UnsupportedElementError, match="joint 'egg' is of the type Ellipsoid"):
+        structure_of(model, make_system(mechanism).constants())
+
+
+def test_variants_of_one_topology_share_one_function() -> None:
+    slider_crank = load("slider_crank")
+    structures = []
+    for mass, length in ((1.0, 1.0), (2.0, 1.0), (0.3, 1.7)):
+        model = slider_crank.model.copy()
+        model.inertias[2] = pin.Inertia(mass, np.array([length / 2, 0.0, 0.0]), 0.1 * np.eye(3))
+        variant = srm.Mechanism(model, slider_crank.loops, q0=slider_crank.q0)
+        structures.append(structure_of(model, make_system(variant).constants())[0])
+        _agree(variant)
+    assert structures[0] == structures[1] == structures[2]

@@ -81,7 +81,7 @@ RANK_GAP = 1e3
 CHECKED_STEPS = 6
 """Closed configurations, beside the start, in which an analysis of a variant is checked."""
 SIMILAR = 4.0
-"""Largest ratio of the norms of rows, and of the last pivot, of two mechanisms with one analysis."""
+"""Largest ratio of row norms, and of last pivots, of two mechanisms with one analysis."""
 
 
 class ManifoldSampler:
@@ -584,9 +584,7 @@ def _walked(structure: Structure, mechanism: MechanismData) -> _Samples | None:
     """A walk of ``CHECKED_STEPS`` from the start of ``mechanism``, with the row scales of
     ``structure``; None if it contradicts the ranks and zero rows of that, or finds nothing."""
     rank = structure.rank
-    sampler = ManifoldSampler(
-        mechanism, coordinate_units(mechanism, mechanism.q0, mechanism.v0)
-    )
+    sampler = ManifoldSampler(mechanism, coordinate_units(mechanism, mechanism.q0, mechanism.v0))
     sampler.scale, sampler.eliminations = structure.row_scale, structure.eliminations
     start, error = sampler.close(mechanism.q0)
     if not rank or not error < CLOSED:

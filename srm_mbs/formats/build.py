@@ -377,21 +377,14 @@ def _advice(error: AssemblyError) -> str:
     )
 
 
-def _closed(
-    mechanism: Mechanism,
-    q: dict[str, Any],
-    v: dict[str, Any],
-    analysis: ReusableAnalysis | None,
-) -> Mechanism:
-    """The mechanism in the state that assembly finds, analysed there unless ``analysis``, that of
-    another variant, is valid for it."""
-    mechanism = consistent_start(mechanism, q, v).mechanism
+def _analysed(mechanism: Mechanism, analysis: ReusableAnalysis | None) -> None:
+    """Analyse a mechanism where its loops are closed, unless ``analysis``, that of another variant,
+    is valid for it."""
     if analysis is not None and structure_of.kept(mechanism) is None:
         structure = analysis.for_variant(mechanism)
         if structure is not None:
             structure_of.keep(mechanism, structure)
     _ = mechanism.structure
-    return mechanism
 
 
 def assembled(reading: Reading) -> Mechanism:
@@ -410,7 +403,11 @@ def assembled(reading: Reading) -> Mechanism:
             reduced, note = without_implied_rows(mechanism, description.closing_tolerance)
             if note:
                 mechanism = replace(reduced, notes=(*reduced.notes, note))
-        mechanism = _closed(mechanism, q, v, reading.analysis)
+        # The mass matrix has to be regular before the analysis factorises it.
+        mechanism = _with_rotors(consistent_start(mechanism, q, v).mechanism)
+        joint = undetermined_joint(mechanism.model, mechanism.q0, source.urdf_path)
+        if joint is None:
+            _analysed(mechanism, reading.analysis)
     except AssemblyError as error:
         error.remedy += _advice(error)
         if description.lock:
@@ -419,8 +416,6 @@ def assembled(reading: Reading) -> Mechanism:
         raise
     except EvaluationError as error:
         raise _in_gimbal_lock(source, str(error)) from error
-    mechanism = _with_rotors(mechanism)
-    joint = undetermined_joint(mechanism.model, mechanism.q0, source.urdf_path)
     if joint is not None:
         raise _in_gimbal_lock(
             source, f"the joint {mechanism.model.names[joint]!r} moves no inertia there"

@@ -87,7 +87,7 @@ def translate(document: Document, options: Options) -> Translation:
     ):
         if names:
             notes.append(f"{note}: {', '.join(names)}")
-    return Translation(root, "", entries, tuple(notes), urdf_file=urdf.file)
+    return Translation(root, None, entries, tuple(notes), urdf_file=urdf.file)
 
 
 def _fault(element: str, problem: str, remedy: str) -> InputError:

@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from numbers import Integral
 from pathlib import Path
 from typing import Any
@@ -120,19 +121,19 @@ def _translated(
     base = None if overrides.base is None else _checked_base(overrides.base)
     options = Options(cut, entries, reach, keyframe, base, description.planar)
     translation = found.translate(model, options)
-    text, given = own.text, overrides.entries()
+    given, as_read = overrides.entries(), bool(own.text)
     if translation.entries or found.key != "urdf":
         urdf_name = Path(model.file).with_suffix(".urdf").name
         entries = merged(entries, translation.entries, urdf_name)
-        text = ""
-    if given or not text:
+        as_read = False
+    if given or not as_read:
         entries = {**entries, **given}
         description = check_description(entries, own.file)
-        text = tomli_w.dumps(entries)
+        as_read = False
     gravity = description.gravity if overrides.gravity is None else overrides.gravity
-    source = Source(
-        description=text,
-        urdf=translation.urdf,
+    source = Source.with_texts_later(
+        partial(str, own.text) if as_read else partial(tomli_w.dumps, entries),
+        lambda: translation.urdf,
         urdf_path=translation.urdf_file or model.file,
         path=own.file,
         base=description.base if base is None else base,
@@ -156,7 +157,7 @@ def _of_description(
     reading, model = _of_tables(own, entries, description, overrides, reach, urdf)
     return replace(
         reading,
-        source=replace(reading.source, parameters=values),
+        source=reading.source.with_parameters(values),
         notes=(*reading.notes, *notes),
         variants=_Variants(given, overrides, reach, model) if values else None,
     )

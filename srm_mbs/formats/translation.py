@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 from xml.etree.ElementTree import Element, indent, tostring
 
@@ -44,6 +45,12 @@ class Options:
     planar: PlanarEntry | None = None
 
 
+def urdf_text(tree: Element) -> str:
+    """The text of a URDF, indented."""
+    indent(tree)
+    return tostring(tree, encoding="unicode") + "\n"
+
+
 @dataclass(frozen=True, eq=False)
 class Translation:
     """A file of any format as a tree and the tables of a description.
@@ -53,8 +60,8 @@ class Translation:
     tree
         Root element of a URDF without loops, in the dialect of ``docs/formats.md``; building the
         mechanism changes it.
-    urdf
-        Its text, by default that of ``tree``.
+    write
+        Makes its text, with what is only drawn; by default that of ``tree`` as it is now.
     entries
         Keys and values of a description (:mod:`srm_mbs.formats.toml.schema`) as ``tomllib`` would
         give them: ``loop``, ``force``, ``initial``, ``base``, ``gravity``, ...; without ``format``
@@ -68,16 +75,20 @@ class Translation:
     """
 
     tree: Element
-    urdf: str = ""
+    write: Callable[[], str] | None = None
     entries: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     urdf_file: str = ""
     check: Callable[[Mechanism], None] | None = None
 
     def __post_init__(self) -> None:
-        if not self.urdf:
-            indent(self.tree)
-            object.__setattr__(self, "urdf", tostring(self.tree, encoding="unicode") + "\n")
+        if self.write is None:  # building the mechanism changes the tree
+            object.__setattr__(self, "write", partial(str, urdf_text(self.tree)))
+
+    @property
+    def urdf(self) -> str:
+        """The text of the URDF."""
+        return "" if self.write is None else self.write()
 
     def extended(self, notes: Iterable[str], **more: Any) -> Translation:
         """With further notes and entries: lists follow those of the same key, and what is empty is

@@ -42,6 +42,9 @@ from srm_mbs.model.validation import (
     without,
 )
 
+_TEXTS = ("description", "urdf")
+"""Fields of a source that may be made later."""
+
 # References to files by their full name, as in filename="/home/author/arm.stl".
 _FOLDER = r"(?:file://)?(?:/|[A-Za-z]:[\\/])(?:[^\"'<>\n]*[\\/])?"
 _FILE_KEYS = "urdf|sdf|mjcf|gepetto|table|file|filename"
@@ -89,6 +92,37 @@ class Source:
                 element="reach",
                 remedy="Give allow_outside to the function that loads it",
             )
+
+    @classmethod
+    def with_texts_later(
+        cls, description: Callable[[], str], urdf: Callable[[], str], /, **others: Any
+    ) -> Self:
+        """A source whose texts are made when they are first asked for: most runs need neither."""
+        made = object.__new__(cls)
+        defaults = cls("", "", **others)
+        for key in fields(cls):
+            if key.name not in _TEXTS:
+                object.__setattr__(made, key.name, getattr(defaults, key.name))
+        object.__setattr__(made, "_texts", {"description": description, "urdf": urdf})
+        return made
+
+    def with_parameters(self, values: Mapping[str, float]) -> Self:
+        """The same source with the ``values`` of its parameters."""
+        made = object.__new__(type(self))
+        made.__dict__.update(self.__dict__)  # not its fields: texts are made when asked for
+        object.__setattr__(made, "parameters", values)
+        return made
+
+    def __getattr__(self, name: str) -> str:
+        """A text that was not made yet: Python asks here for missing attributes only."""
+        if name not in _TEXTS or "_texts" not in self.__dict__:
+            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}", name=name)
+        text: str = self.__dict__["_texts"][name]()
+        object.__setattr__(self, name, text)
+        return text
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key.name: getattr(self, key.name) for key in fields(self)}
 
     def entries(self) -> dict[str, Any]:
         """The fields that are saved: all but the reach."""

@@ -108,9 +108,9 @@ def test_a_conversion_parses_its_file_once(tmp_path: Path, counted: Counter[Any]
     assert counted == {"robot.sdf": 1, "XML": 1, "mechanism": 1}
 
 
-@pytest.mark.parametrize(("more", "times"), [("", 1), ("v = { a = 1.0 }\n", 2)])
+@pytest.mark.parametrize("more", ["", "v = { a = 1.0 }\n"])
 def test_loops_are_analysed_where_they_are_closed(
-    more: str, times: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    more: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Once, from an open guess too; given rates are where the walks of the analysis begin."""
     analysed = []
@@ -126,6 +126,7 @@ def test_loops_are_analysed_where_they_are_closed(
     (tmp_path / "robot.toml").write_text(f'format = 1\nsdf = "robot.sdf"\n{guess}{more}')
     mechanism = srm.load(tmp_path / "robot.toml")
     assert mechanism.structure.rank == 2
-    assert len(analysed) == times
+    assert len(analysed) == 1
+    assert np.array_equal(analysed[0].v0, mechanism.v0)
     for each in analysed:
         assert np.abs(each.initial_errors[0]).max() < 1e-11

@@ -81,7 +81,7 @@ RANK_GAP = 1e3
 CHECKED_STEPS = 6
 """Closed configurations, beside the start, in which an analysis of a variant is checked."""
 SIMILAR = 4.0
-"""Largest ratio of norms of rows, and of last pivots, of two mechanisms with one analysis."""
+"""Largest ratio of row norms, and of last pivots, of two mechanisms with one analysis."""
 
 
 class ManifoldSampler:

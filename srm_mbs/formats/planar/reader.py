@@ -43,7 +43,7 @@ from srm_mbs.formats.planar.shapes import (
     turned,
 )
 from srm_mbs.formats.toml.schema import PlanarEntry, PlanarSlider
-from srm_mbs.formats.translation import Options, Translation
+from srm_mbs.formats.translation import Options, Translation, urdf_text
 from srm_mbs.model.anchors import WORLD
 
 HINGE_AXIS = (0.0, -1.0, 0.0)
@@ -256,14 +256,6 @@ class _Linkage:
 
     def translation(self) -> Translation:
         drawing, entry = self.drawing, self.entry
-        bodies = [Body(name, self._inertia(name), self._visuals(name)) for name in self.bodies[1:]]
-        tree = urdf_tree(
-            self.options.own.get("name", "") or "linkage",
-            bodies,
-            list(map(self._placed, self.joints)),
-        )
-        world = next(link for link in tree.findall("link") if link.get("name") == WORLD)
-        world.extend(self._ground_visuals())
         entries: dict[str, Any] = {}
         if entry.gravity is not None:
             if "gravity" in self.options.own:
@@ -281,7 +273,26 @@ class _Linkage:
             name: self._anchor(self._carrier(name, f"point {name!r}"), name)
             for name in drawing.points
         }
-        return Translation(tree, entries=entries, notes=tuple(self._notes()), check=self._check)
+        return Translation(
+            self._urdf(drawn=False),
+            lambda: urdf_text(self._urdf(drawn=True)),
+            entries,
+            tuple(self._notes()),
+            check=self._check,
+        )
+
+    def _urdf(self, drawn: bool) -> Element:
+        """The tree; most of it is what is only ``drawn``."""
+        bodies = [
+            Body(name, self._inertia(name), self._visuals(name) if drawn else ())
+            for name in self.bodies[1:]
+        ]
+        name = self.options.own.get("name", "") or "linkage"
+        tree = urdf_tree(name, bodies, list(map(self._placed, self.joints)))
+        if drawn:
+            world = next(link for link in tree.findall("link") if link.get("name") == WORLD)
+            world.extend(self._ground_visuals())
+        return tree
 
     def _placed(self, joint: Joint) -> Joint:
         """A joint of the tree with its frame on the parent; that on the child is the link's."""

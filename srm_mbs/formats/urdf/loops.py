@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -122,7 +123,8 @@ def translate(document: Document, options: Options) -> Translation:
     if found:
         elements.named(root, "joint")
         notes += [*elements.notes, *elements.ignored_notes()]
-    return Translation(root, "" if found else document.text, entries, tuple(notes))
+    text = None if found else partial(str, document.text)
+    return Translation(root, text, entries, tuple(notes))
 
 
 def _is_satisfied(loop: Mapping[str, Any], graph: Graph) -> bool:

@@ -1,0 +1,160 @@
+"""Variants reuse the load-time analysis where it is valid; texts are made when asked for."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import srm_mbs as srm
+from srm_mbs.dynamics.constraints import structure as structures
+from srm_mbs.dynamics.constraints.structure import ReusableAnalysis
+
+FOUR_BAR = """format = 1
+name = "bars"
+[parameters]
+crank = 0.4
+ground = 1.0
+mass = 1.0
+[planar]
+ground = ["O", "C"]
+mass_per_length = "=mass"
+rates = { O = 3.0 }
+[planar.points]
+O = [0, 0]
+A = ["=0.6*crank", "=0.8*crank"]
+B = ["=0.6*crank + 0.8*ground", "=0.8*crank + 0.3*ground"]
+C = ["=ground", 0]
+[[planar.bar]]
+name = "crank"
+points = ["O", "A"]
+[[planar.bar]]
+name = "coupler"
+points = ["A", "B"]
+[[planar.bar]]
+name = "rocker"
+points = ["B", "C"]
+"""
+
+
+@pytest.fixture
+def bars(tmp_path: Path) -> Path:
+    path = tmp_path / "bars.toml"
+    path.write_text(FOUR_BAR, encoding="utf-8")
+    return path
+
+
+class Analyses:
+    """Counts the analyses that are made."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.count = 0
+        made = structures.analyse
+
+        def analyse(mechanism: Any) -> Any:
+            self.count += 1
+            return made(mechanism)
+
+        monkeypatch.setattr(structures, "analyse", analyse)
+
+
+def test_a_load_makes_one_analysis(monkeypatch: pytest.MonkeyPatch) -> None:
+    analyses = Analyses(monkeypatch)
+    for name in ("four_bar", "klann_walker", "slider_crank"):
+        srm.load(name)
+    assert analyses.count == 3
+
+
+def test_a_similar_variant_reuses_the_analysis_and_moves_as_one_with_its_own(
+    bars: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = srm.load(bars)
+    analyses = Analyses(monkeypatch)
+    variant = base.with_parameters(crank=0.45, mass=2.0)
+    assert analyses.count == 0
+    assert variant.structure.units.length != base.structure.units.length
+    fresh = srm.load(bars, parameters={"crank": 0.45, "mass": 2.0})
+    assert analyses.count == 1
+    assert np.array_equal(variant.q0, fresh.q0)
+    assert np.array_equal(variant.v0, fresh.v0)
+    for name in ("rank", "loop_rank", "redundant_rows", "notes"):
+        assert getattr(variant.structure, name) == getattr(fresh.structure, name)
+    assert variant.mobility == fresh.mobility
+    one, other = (srm.simulate(each, 2.0, rtol=1e-10) for each in (variant, fresh))
+    times = np.linspace(0.0, 2.0, 9)
+    assert np.abs(one(times)[0] - other(times)[0]).max() < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        ({"mass": 1e-3}, "rows are 30 times as long in the mass metric"),
+        ({"ground": 100.0, "crank": 40.0}, "so are they with other lengths"),
+    ],
+)
+def test_a_variant_of_other_scales_is_analysed_itself(
+    bars: Path, values: dict[str, float], why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = srm.load(bars)
+    analyses = Analyses(monkeypatch)
+    variant = base.with_parameters(**values)
+    assert analyses.count == 1, why
+    fresh = srm.load(bars, parameters=values)
+    assert variant.structure.sigma_ref == fresh.structure.sigma_ref
+    assert np.array_equal(variant.structure.row_scale, fresh.structure.row_scale)
+
+
+def test_an_analysis_of_other_closures_is_refused(bars: Path) -> None:
+    base = srm.load(bars)
+    analysis = ReusableAnalysis.of(base)
+    assert analysis is not None
+    assert analysis.for_variant(base) is not None
+    assert analysis.for_variant(srm.load("four_bar")) is None  # another name of the loop
+    loop = base.loops[0]
+    flat = srm.LoopClosure("point_on_plane", loop.a, loop.b, axis=(1.0, 0.0, 0.0), name=loop.name)
+    assert analysis.for_variant(base.without_loop(loop.name).with_loop(flat)) is None
+
+
+def test_a_start_that_is_open_refuses_the_analysis_of_another(bars: Path) -> None:
+    base = srm.load(bars)
+    analysis = ReusableAnalysis.of(base)
+    assert analysis is not None
+    loop = base.loops[0]
+    far = srm.Anchor(link=loop.b.link, xyz=(50.0, 0.0, 0.0))
+    beyond = srm.LoopClosure("point", loop.a, far, name=loop.name)
+    assert analysis.for_variant(base.without_loop(loop.name).with_loop(beyond)) is None
+
+
+def test_variants_do_not_depend_on_the_order_in_which_they_are_made(bars: Path) -> None:
+    base = srm.load(bars)
+    direct = base.with_parameters(crank=0.42, mass=1.5)
+    for way in (
+        base.with_parameters(mass=1e-3).with_parameters(crank=0.42, mass=1.5),
+        pickle.loads(pickle.dumps(base.with_parameters(crank=0.3))).with_parameters(
+            crank=0.42, mass=1.5
+        ),
+    ):
+        assert way.structure.sigma_ref == direct.structure.sigma_ref
+        assert np.array_equal(way.structure.row_scale, direct.structure.row_scale)
+        assert np.array_equal(way.q0, direct.q0)
+
+
+def test_texts_of_a_linkage_are_those_of_its_numbers(bars: Path, tmp_path: Path) -> None:
+    variant = srm.load(bars).with_parameters(crank=0.45)
+    source, copied = variant.source, pickle.loads(pickle.dumps(variant)).source
+    assert source is not None
+    assert "<visual>" in source.urdf
+    assert source == copied
+    assert source.urdf == srm.load(bars, parameters={"crank": 0.45}).source.urdf  # type: ignore[union-attr]
+    with pytest.raises(AttributeError, match="no attribute 'text'"):
+        _ = source.text  # type: ignore[attr-defined]
+    written = tmp_path / "written"
+    written.mkdir()
+    (written / "bars.toml").write_text(source.description, encoding="utf-8")
+    (written / "bars.urdf").write_text(source.urdf, encoding="utf-8")
+    again = srm.load(written / "bars.toml")
+    assert again.model == variant.model
+    assert np.abs(again.q0 - variant.q0).max() < 1e-12

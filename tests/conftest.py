@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,10 @@ from srm_mbs.integration.kernel import backend
 from srm_mbs.visualization.animation.video import browser as headless_browser
 
 DATA = Path(__file__).parent / "data"
+
+# Tests leave the user's compiled code alone; all processes of a session share theirs.
+_CACHE = tempfile.TemporaryDirectory(prefix="srm-mbs-tests-")
+os.environ.setdefault("SRM_MBS_CACHE", _CACHE.name)
 
 # Without a kernel the tests ask for the Python reference, which runs would warn of.
 if srm.backend() == "python":

@@ -30,8 +30,8 @@ from srm_mbs.integration.events import (
     same_time,
     stop_message,
 )
+from srm_mbs.integration.generated.code import code_of_record
 from srm_mbs.integration.kernel.backend import COMPILED
-from srm_mbs.integration.kernel.dense_output import code_for
 from srm_mbs.integration.kernel.system import Evaluator
 from srm_mbs.integration.kernel.system import workspace as workspace_of
 from srm_mbs.model.drives import positions
@@ -620,7 +620,7 @@ def _equations(part: SimulationResult) -> Iterator[Any]:
     elif part.kernel_system is not None:
         yield Evaluator(system, part.kernel_system)
     else:
-        code = code_for(part.settings.backend, system)
+        code = code_of_record(part.settings.backend, system.mechanism)
         with workspace_of(system, code) as kernel_system:
             yield Evaluator(system, kernel_system)
 

@@ -98,8 +98,18 @@ def test_a_run_is_saved_loaded_and_copied_with_its_backend(tmp_path: Path) -> No
     solution.save(tmp_path / "run.npz")
     for other in (srm.load_solution(tmp_path / "run.npz"), pickle.loads(pickle.dumps(solution))):
         assert other.settings.backend == "generated"
-        assert np.abs(other.at([0.333]).q - solution.at([0.333]).q).max() < 1e-12
+        assert np.array_equal(other.at([0.333]).q, solution.at([0.333]).q)
     assert "generated code" in row(run("info", tmp_path / "run.npz"), "computed by")
+
+
+def test_a_loaded_run_compiles_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    solution = finished(load("four_bar"), 1.0, backend="generated")
+    solution.save(tmp_path / "run.npz")
+    monkeypatch.setattr(code, "_libraries", type(code._libraries)())
+    monkeypatch.setenv("SRM_MBS_CACHE", str(tmp_path / "nothing"))
+    other = srm.load_solution(tmp_path / "run.npz")
+    assert np.abs(other.at([0.333]).q - solution.at([0.333]).q).max() < 1e-13
+    assert not list((tmp_path / "nothing").glob("*.so"))
 
 
 def test_threads_share_generated_code() -> None:
@@ -137,7 +147,7 @@ def test_without_a_compiler_the_error_says_so(
 ) -> None:
     monkeypatch.setattr(code_cache, "compiler", lambda: None)
     monkeypatch.setattr(code, "_libraries", type(code._libraries)())
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("SRM_MBS_CACHE", str(tmp_path))
     with pytest.raises(srm.InputError, match="there is no C compiler") as caught:
         srm.simulate(srm.load("four_bar"), 0.1, backend="generated")
     assert caught.value.remedy.startswith("Install a C compiler")

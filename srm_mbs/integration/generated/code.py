@@ -7,6 +7,7 @@ cache of the user, or newly compiled.
 from __future__ import annotations
 
 from collections import OrderedDict, deque
+from collections.abc import Callable
 from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
@@ -16,7 +17,12 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError, get_logger
-from srm_mbs.integration.generated.code_cache import CompilationError, Compiled, compile_and_load
+from srm_mbs.integration.generated.code_cache import (
+    CompilationError,
+    Compiled,
+    compile_and_load,
+    load_cached,
+)
 from srm_mbs.integration.generated.structure import (
     Structure,
     UnsupportedElementError,
@@ -78,27 +84,43 @@ def _loaded(mechanism: MechanismData) -> deque[Any]:
     return deque(maxlen=1)
 
 
-def loaded_code(mechanism: Mechanism) -> Any:
-    """The ``GeneratedTerms`` of a mechanism, if :func:`load_code` made them in this process; else
-    None."""
-    found = _loaded(mechanism)
-    return found[0] if found else None
-
-
-def load_code(mechanism: Mechanism) -> Any:
+def load_code(mechanism: Mechanism, compiles: bool = True) -> Any:
     """The ``GeneratedTerms`` of a mechanism.
+
+    Parameters
+    ----------
+    compiles
+        Whether code is compiled that is neither in this process nor in the cache; None is returned
+        otherwise.
 
     Raises
     ------
     InputError
         If its code cannot be generated or compiled.
     """
-    found = loaded_code(mechanism)
-    if found is None:
+    found = _loaded(mechanism)
+    if not found:
         structure, parameters = _structure(mechanism)
-        found = _library(structure, parameters).terms.with_parameters(parameters)
-        _loaded(mechanism).append(found)
-    return found
+        find = _library if compiles else _cached_library
+        library = find(structure, parameters)
+        if library is None:
+            return None
+        found.append(library.terms.with_parameters(parameters))
+    return found[0]
+
+
+def code_of_record(by: str, mechanism: Mechanism) -> Any:
+    """The ``GeneratedTerms`` of a run that the backend ``by`` made, maybe elsewhere, or None.
+
+    Without them the kernel evaluates its output, which agrees to rounding: reading a run compiles
+    nothing.
+    """
+    if by != "generated":
+        return None
+    try:
+        return load_code(mechanism, compiles=False)
+    except InputError:
+        return None
 
 
 def code_of_run(by: str, asked: str, mechanism: Mechanism) -> tuple[str, Any]:
@@ -178,28 +200,52 @@ def _source(structure: Structure) -> Source:
 
 def _library(structure: Structure, parameters: FloatArray) -> _Library:
     """The code of a structure; ``parameters`` are those of one mechanism of it."""
-    if core is None:
-        raise InputError(
-            "generated code needs the compiled kernel, which is not available",
-            element="backend",
-            remedy="Use the backend auto",
-        )
-    with _lock:
-        found = _libraries.get(structure)
-        if found is not None:
-            _libraries.move_to_end(structure)
-            return found
+    found = _known(structure)
+    if found is not None:
+        return found
     source = _source(structure)
     try:
-        terms, compiled = compile_and_load(
-            source.text, lambda path: core.GeneratedTerms(str(path), parameters)
-        )
+        return _remember(structure, source, *compile_and_load(source.text, _loader(parameters)))
     except CompilationError as error:
         raise InputError(
             f"the generated code cannot be compiled: {error}",
             element="backend",
             remedy=f"{error.remedy}, or use the backend kernel",
         ) from error
+
+
+def _cached_library(structure: Structure, parameters: FloatArray) -> _Library | None:
+    """As :func:`_library`; None where it would have to be compiled."""
+    found = _known(structure)
+    if found is not None:
+        return found
+    source = _source(structure)
+    made = load_cached(source.text, _loader(parameters))
+    return None if made is None else _remember(structure, source, *made)
+
+
+def _loader(parameters: FloatArray) -> Callable[[Path], Any]:
+    """Makes ``GeneratedTerms`` of the path of a library."""
+    if core is None:
+        raise InputError(
+            "generated code needs the compiled kernel, which is not available",
+            element="backend",
+            remedy="Use the backend auto",
+        )
+    make = core.GeneratedTerms
+    return lambda path: make(str(path), parameters)
+
+
+def _known(structure: Structure) -> _Library | None:
+    """The code of a structure that this process has."""
+    with _lock:
+        found = _libraries.get(structure)
+        if found is not None:
+            _libraries.move_to_end(structure)
+        return found
+
+
+def _remember(structure: Structure, source: Source, terms: Any, compiled: Compiled) -> _Library:
     with _lock:
         _libraries[structure] = library = _Library(source, terms, compiled)
         while len(_libraries) > KEPT:

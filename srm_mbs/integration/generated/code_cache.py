@@ -112,10 +112,14 @@ def processor() -> str:
 
 
 def cache_folder() -> Path:
-    """Where compiled code lies: in srm-mbs below XDG_CACHE_HOME or the system's folder for caches.
+    """Where compiled code lies: the environment variable SRM_MBS_CACHE, else srm-mbs below
+    XDG_CACHE_HOME or the system's folder for caches.
 
     The folder need not exist.
     """
+    own = os.environ.get("SRM_MBS_CACHE", "")
+    if os.path.isabs(own):
+        return Path(own)
     given = os.environ.get("XDG_CACHE_HOME", "")
     if os.path.isabs(given):
         base = Path(given)
@@ -167,6 +171,24 @@ def _intact(library: Path) -> bool:
         return False
 
 
+def load_cached(source: str, load: Callable[[Path], Loaded]) -> tuple[Loaded, Compiled] | None:
+    """As :func:`compile_and_load`, but None where the cache has no library of ``source``."""
+    chosen = compiler()
+    folder = None if chosen is None else _usable_folder()
+    if chosen is None or folder is None:
+        return None
+    library = folder / f"{_key(source, chosen)}.so"
+    if not _intact(library):
+        return None
+    try:
+        loaded = load(library)
+    except ValueError:
+        return None
+    with suppress(OSError):
+        os.utime(library)
+    return loaded, Compiled(0.0, library)
+
+
 def compile_and_load(
     source: str, load: Callable[[Path], Loaded], patience: float = PATIENCE
 ) -> tuple[Loaded, Compiled]:
@@ -193,15 +215,11 @@ def compile_and_load(
             "names none",
             "Install a C compiler",
         )
-    key = _key(source, chosen)
-    folder = _usable_folder()
+    found = load_cached(source, load)
+    if found is not None:
+        return found
+    folder, key = _usable_folder(), _key(source, chosen)
     library = None if folder is None else folder / f"{key}.so"
-    if library is not None and _intact(library):
-        with suppress(ValueError):
-            loaded = load(library)
-            with suppress(OSError):
-                os.utime(library)
-            return loaded, Compiled(0.0, library)
     with tempfile.TemporaryDirectory(prefix="srm-mbs-") as made_in:
         started = time.perf_counter()
         made = Path(made_in, f"{key}.so")

@@ -663,8 +663,8 @@ def source_of(structure: Structure) -> Source:
     """The C source of the terms of ``structure``.
 
     It defines ``srm_mbs_sizes``, the sizes of its arguments; ``srm_mbs_constants``, which computes
-    k from the parameters p; ``srm_mbs_terms``, of an evaluation; and ``srm_mbs_factor``, the
-    algebra of one (generated.hpp).
+    k from the parameters p; ``srm_mbs_terms``, of an evaluation; ``srm_mbs_factor``, its algebra
+    (generated.hpp).
 
     Raises
     ------

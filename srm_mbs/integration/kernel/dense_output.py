@@ -11,7 +11,7 @@ from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.integration.dense_output import DenseOutput, StepData
-from srm_mbs.integration.generated.code import loaded_code
+from srm_mbs.integration.generated.code import code_of_record
 from srm_mbs.integration.kernel import marshalling
 from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import CompiledObservables
@@ -30,15 +30,10 @@ def dense_output(
         Backend of the run.
     """
     if made_by in COMPILED and core is not None:
-        code = code_for(made_by, system)
+        code = code_of_record(made_by, system.mechanism)
         own = None if shared(system) else make_kernel_system(system, code)
         return CompiledDenseOutput(own, system, scheme, steps, made_by=made_by)
     return DenseOutput(system, scheme, steps)
-
-
-def code_for(made_by: str, system: ClosedSystem | OpenSystem) -> Any:
-    """The generated code of a run, if it made the run in this process."""
-    return loaded_code(system.mechanism) if made_by == "generated" else None
 
 
 class CompiledDenseOutput(DenseOutput):
@@ -86,7 +81,7 @@ class CompiledDenseOutput(DenseOutput):
         try:
             if self.kernel_system is not None:
                 return self._states(self.kernel_system, t)
-            code = code_for(self._made_by, self._mechanism_system)
+            code = code_of_record(self._made_by, self._mechanism_system.mechanism)
             with workspace(self._mechanism_system, code) as kernel_system:
                 return self._states(kernel_system, t)
         except ArithmeticError:

@@ -27,6 +27,7 @@ SEVEN = "int seven(void) { return 7; }\n"
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The cache of a test; its folder does not exist at first."""
+    monkeypatch.delenv("SRM_MBS_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path / "cache" / "srm-mbs" / "code"
 
@@ -91,6 +92,21 @@ def test_a_folder_of_another_user_or_a_link_is_unsafe(
     uid = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: uid + 1)
     assert "belongs to another user" in str(code_cache.unsafe_reason(own))
+
+
+def test_the_folder_can_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SRM_MBS_CACHE", str(tmp_path / "elsewhere"))
+    path = compile_and_load(SEVEN, _seven)[1].path
+    assert path is not None
+    assert path.parent == tmp_path / "elsewhere"
+
+
+def test_the_cache_alone_compiles_nothing() -> None:
+    assert code_cache.load_cached(SEVEN, _seven) is None
+    compile_and_load(SEVEN, _seven)
+    found = code_cache.load_cached(SEVEN, _seven)
+    assert found is not None
+    assert (found[0], found[1].seconds) == (7, 0.0)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "changed", "empty", "no digest"])

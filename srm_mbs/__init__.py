@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from srm_mbs.analysis.path_following import FollowedPath, follow
     from srm_mbs.api import DaeSolution, Solution, compile, load_solution, simulate, solve_dae
     from srm_mbs.assembly.assemble import Assembly, assemble
+    from srm_mbs.dynamics.actuation import actuator_controller
     from srm_mbs.dynamics.mechanism import Mechanism
     from srm_mbs.errors import (
         AnalysisError,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from srm_mbs.integration.methods.psrm import PSRM
     from srm_mbs.integration.methods.tableaus import TABLEAUS
     from srm_mbs.integration.methods.thesis.srm import SRM
+    from srm_mbs.model.actuators import Actuator
     from srm_mbs.model.anchors import Anchor
     from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure
     from srm_mbs.model.dae import SemiExplicitDAE
@@ -76,6 +78,7 @@ _NAMES = {
     "analysis.path_following": "FollowedPath follow",
     "api": "DaeSolution Solution compile load_solution simulate solve_dae",
     "assembly.assemble": "Assembly assemble",
+    "dynamics.actuation": "actuator_controller",
     "dynamics.mechanism": "Mechanism",
     "errors": "__version__ AnalysisError AssemblyError InputError SimulationError SrmError "
     "SrmWarning",
@@ -87,6 +90,7 @@ _NAMES = {
     "integration.methods.psrm": "PSRM",
     "integration.methods.tableaus": "TABLEAUS",
     "integration.methods.thesis.srm": "SRM",
+    "model.actuators": "Actuator",
     "model.anchors": "Anchor",
     "model.closures": "CLOSURE_TYPES LoopClosure",
     "model.dae": "SemiExplicitDAE",
@@ -115,6 +119,7 @@ __all__ = [
     "PSRM",
     "SRM",
     "TABLEAUS",
+    "Actuator",
     "AnalysisError",
     "Anchor",
     "Assembly",
@@ -160,6 +165,7 @@ __all__ = [
     "TorsionSpring",
     "UserForce",
     "Wrench",
+    "actuator_controller",
     "assemble",
     "assembly_modes",
     "backend",

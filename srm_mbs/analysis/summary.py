@@ -304,6 +304,18 @@ def drive_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
         yield drive.name, drive.law.type, place, ", ".join(values)
 
 
+def actuator_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
+    """(name, type, joint, values that are not the defaults) of each actuator."""
+    for name, actuator in mechanism.actuators.items():
+        values = []
+        for key in fields(actuator):
+            value = getattr(actuator, key.name)
+            if key.name not in ("joint", "type") and value != key.default:
+                text = f"{value:.6g}" if isinstance(value, float) else vector_text(value)
+                values.append(f"{key.name} {text}")
+        yield name, actuator.type, actuator.joint, ", ".join(values)
+
+
 def _anchor(anchor: Anchor) -> str:
     text = anchor.where
     if any(anchor.xyz):

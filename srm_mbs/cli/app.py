@@ -26,7 +26,7 @@ import typer
 
 import srm_mbs
 from srm_mbs.cli import analysis, playback, plot_report
-from srm_mbs.cli.model_file import ModelFile, reads_model
+from srm_mbs.cli.model_file import ModelFile, named_numbers, reads_model
 from srm_mbs.cli.output import (
     BAD_INPUT,
     HTML_SUFFIXES,
@@ -202,6 +202,15 @@ def simulate(
             "smallest that keep the loops closed.",
         ),
     ] = None,
+    control: Annotated[
+        list[str] | None,
+        several(
+            "--control",
+            "ACTUATOR=VALUE",
+            "Control an actuator: the force of a motor (N m, N), the position or rate of a servo. "
+            "With it all actuators act, the others with 0.",
+        ),
+    ] = None,
 ) -> None:
     """Simulate a mechanism and print a summary of the run.
 
@@ -242,10 +251,15 @@ def simulate(
     defaults = mechanism.defaults
     t_end = _first(t_end, defaults.t_end, T_END)
     playback.check_time(at, t_end)
+    controller = None
+    if control:
+        controls = named_numbers(control, "--control", "actuator", "hip")
+        controller = srm_mbs.actuator_controller(mechanism, controls)
     view = playback.live_view(mechanism) if live else None
     solution = srm_mbs.simulate(
         mechanism,
         t_end,
+        controller=controller,
         method=method,
         tableau=tableau,
         rtol=_first(rtol, defaults.rtol, RTOL),
@@ -339,11 +353,12 @@ def info(file: ModelFile) -> None:
     """Describe a mechanism: joints, loops, forces, the start.
 
     With its size and mass, its degrees of freedom, the rank of its closure rows, the rows that are
-    redundant, and what is stiff.  Of a saved run (.npz) first a summary, with the residuals of the
+    redundant, what is stiff, and its drives and actuators.  Of a saved run (.npz) first a summary, with the residuals of the
     singular configurations it met.
     """
     from srm_mbs._kernel import missing, remedy
     from srm_mbs.analysis.summary import (
+        actuator_rows,
         drive_rows,
         force_rows,
         joint_rows,
@@ -366,6 +381,7 @@ def info(file: ModelFile) -> None:
         (("loop", "type", "a", "b", "gap at the start"), loop_rows(mechanism)),
         (("force", "type", "acts on", "values"), force_rows(mechanism)),
         (("drive", "law", "moves", "values"), drive_rows(mechanism)),
+        (("actuator", "type", "joint", "values"), actuator_rows(mechanism)),
         (("stiff", "coefficient", "time constant"), stiff_rows(mechanism)),
     ):
         if listed := list(rows):

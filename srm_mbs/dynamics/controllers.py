@@ -141,6 +141,8 @@ def _output(name: str, function: Controller, t: float, q: FloatArray, v: FloatAr
     """The result of ``function``, unchecked."""
     try:
         return function(t, q.copy(), v.copy())
+    except ControllerError:  # of a controller of this package, whose message is complete
+        raise
     except Exception as error:
         raise ControllerError(f"{name} raised {safe_repr(error)} at t = {t:.6g} s", t) from error
 

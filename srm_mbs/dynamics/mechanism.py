@@ -46,6 +46,9 @@ class Mechanism(MechanismData):
     points
         Named points of links or of the ground, by name: those of ``[points]`` of a description, and
         of a planar linkage.
+    actuators
+        Motors and servos by name (:class:`srm_mbs.Actuator`), for
+        :func:`srm_mbs.actuator_controller`; without a controller they exert no force.
 
     Raises
     ------

@@ -234,6 +234,7 @@ def unassembled(
     defaults = description.simulation
     csv = CsvFolder(Path(source.path).parent, source.reach) if tables else None
     friction_speed = description.friction_speed
+    actuators, idle = description.named_actuators()
     mechanism = reading.kind(
         model,
         description.closures(),
@@ -251,9 +252,11 @@ def unassembled(
             *reading.notes,
             *built.notes,
             *massless,
+            *idle,
             *_friction_note(model, friction_speed),
         ),
         points=description.named_points(),
+        actuators=actuators,
     )
     if description.limits == "spring":
         mechanism = _with_limit_springs(mechanism)

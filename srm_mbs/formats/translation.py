@@ -102,7 +102,7 @@ class Translation:
 
 LISTS = ("lock", "loop", "force", "drive")
 """Keys whose lists in a description and in the file that it names are joined."""
-TABLES = ("simulation", "gravity_compensation", "points")
+TABLES = ("simulation", "gravity_compensation", "points", "actuators")
 """Tables that are merged key by key."""
 MODEL_KEYS = ("urdf", "sdf", "mjcf")
 """Keys of a description that name a file of another format."""

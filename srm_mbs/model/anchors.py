@@ -202,3 +202,21 @@ def one_degree_joint(model: pin.Model, name: str | None, element: str, instead: 
             remedy=instead,
         )
     return joint
+
+
+def turn_counting_joint(model: pin.Model, name: str | None, element: str, instead: str) -> Any:
+    """:func:`one_degree_joint` whose coordinate counts turns: not a (cos, sin) pair.
+
+    Raises
+    ------
+    InputError
+        About ``element``, as there, and for a continuous joint.
+    """
+    joint = one_degree_joint(model, name, element, instead)
+    if joint.nq != 1:
+        raise InputError(
+            f"the angle of the continuous joint {safe_repr(name)} does not count turns",
+            element=element,
+            remedy='Make the joint "revolute" in the URDF, with wide limits: they do not act',
+        )
+    return joint

@@ -29,6 +29,7 @@ from srm_mbs.model.anchors import (
     one_degree_joint,
     resolve_apart,
     resolve_moving,
+    turn_counting_joint,
 )
 from srm_mbs.model.laws import Law
 from srm_mbs.model.numbers import checked_name, finite_array, finite_numbers, plain
@@ -330,14 +331,8 @@ class TorsionSpring(ForceElement):
         self._refuse_zeros("stiffness", "damping")
 
     def check(self, model: pin.Model) -> None:
-        joint = one_degree_joint(
-            model, self.joint, self._element, "Use a bushing between its links"
-        )
-        if joint.nq != 1 and self.stiffness:
-            raise self._fault(
-                f"the angle of the continuous joint {self.joint!r} does not count turns",
-                'Make the joint "revolute" in the URDF, with wide limits: they do not act',
-            )
+        kind = turn_counting_joint if self.stiffness else one_degree_joint
+        kind(model, self.joint, self._element, "Use a bushing between its links")
 
 
 @dataclass(frozen=True)
@@ -404,14 +399,9 @@ class CouplingSpring(ForceElement):
 
     def check(self, model: pin.Model) -> None:
         for name in self.joints:
-            joint = one_degree_joint(
+            turn_counting_joint(
                 model, name, self._element, "Name joints with one degree of freedom"
             )
-            if joint.nq != 1:
-                raise self._fault(
-                    f"the angle of the continuous joint {name!r} does not count turns",
-                    'Make the joint "revolute" in the URDF, with wide limits: they do not act',
-                )
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, known_names, safe_repr
+from srm_mbs.model.actuators import Actuator, checked_actuators
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive, positions
@@ -245,6 +246,7 @@ class MechanismData(ResultOwner):
     defaults: SimulationDefaults = field(default_factory=SimulationDefaults)
     notes: tuple[str, ...] = ()
     points: Mapping[str, Anchor] = field(default_factory=dict)
+    actuators: Mapping[str, Actuator] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._forget()
@@ -268,6 +270,7 @@ class MechanismData(ResultOwner):
         set_(self, "drives", checked_elements(model, "drive", self.drives, "Drive"))
         set_(self, "friction_speed", checked_friction_speed(model, self.friction_speed))
         set_(self, "points", checked_points(model, self.points))
+        set_(self, "actuators", checked_actuators(model, self.actuators))
 
     def _forget(self) -> None:
         """Begin without results."""

@@ -51,7 +51,7 @@ LONGEST_NAME = 1000
 LONGEST_SENTENCE = 100_000
 """Characters of a message or a note."""
 MOST_ELEMENTS = 10_000
-"""Closures, forces or drives of a mechanism."""
+"""Closures, forces, drives, points or actuators of a mechanism."""
 LARGEST_NUMBER = 1e100
 """Of an array of a run: where runs end because products of larger ones overflow."""
 JOIN_TOLERANCE = 1e-9
@@ -89,6 +89,7 @@ Positive = Annotated[float, Field(gt=0.0, le=LARGEST_MAGNITUDE, allow_inf_nan=Fa
 Numbers = Annotated[list[Any], AfterValidator(finite_numbers)]
 Sentences = Annotated[list[Sentence], Field(max_length=MOST_ELEMENTS)]
 Elements = Annotated[list[dict[str, Any]], Field(max_length=MOST_ELEMENTS)]
+NamedElements = Annotated[dict[Name, dict[str, Any]], Field(max_length=MOST_ELEMENTS)]
 
 
 class SourceEntry(StrictData):
@@ -126,7 +127,8 @@ class MechanismEntry(StrictData):
     friction_speed: Positive
     defaults: DefaultsEntry
     notes: Sentences
-    points: Annotated[dict[Name, dict[str, Any]], Field(max_length=MOST_ELEMENTS)] = Field({})
+    points: NamedElements = Field({})
+    actuators: NamedElements = Field({})
 
 
 class StructureEntry(StrictData):

@@ -43,6 +43,7 @@ from srm_mbs.integration.kernel.dense_output import dense_output
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.integration.methods.tableaus import TABLEAUS, get_tableau
 from srm_mbs.integration.methods.thesis.srm import SRM
+from srm_mbs.model.actuators import Actuator
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive
@@ -257,6 +258,7 @@ def _run_arrays(solution: SimulationResult, path: Path, full_paths: bool) -> dic
             "defaults": asdict(mechanism.defaults),
             "notes": _notes(mechanism, full_paths),
             "points": {name: _plain(anchor) for name, anchor in mechanism.points.items()},
+            "actuators": {name: _plain(one) for name, one in mechanism.actuators.items()},
         },
         "structure": {name: getattr(structure, name) for name in STRUCTURE_VALUES}
         | {"length": structure.units.length, "rate": structure.units.rate},
@@ -490,6 +492,7 @@ def _mechanism(run: saved_run.RunEntry, arrays: Arrays, path: Path, reach: Reach
         defaults=SimulationDefaults(**entry.defaults.model_dump()),
         notes=tuple(entry.notes),
         points={name: saved_run.element(Anchor, point) for name, point in entry.points.items()},
+        actuators={name: saved_run.element(Actuator, a) for name, a in entry.actuators.items()},
     )
     if entry.drive_starts:
         return mechanism.with_drive_curves(_drive_curves(mechanism.drives, entry.drive_starts))

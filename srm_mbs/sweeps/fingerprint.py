@@ -23,7 +23,7 @@ import pinocchio as pin
 
 from srm_mbs.dynamics.mechanism import Mechanism
 
-_IGNORED_FIELDS = ("name", "source", "defaults", "notes", "points")
+_IGNORED_FIELDS = ("name", "source", "defaults", "notes", "points", "actuators")
 """Fields of a mechanism that do not influence a run."""
 
 

@@ -12,6 +12,7 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
+from tests.support.actuators import check_forces
 from tests.support.mujoco_twins import Twins, check_dynamics, check_residuals
 
 ROBOTS = Path(__file__).parents[1] / "data" / "robots"
@@ -32,6 +33,20 @@ def test_an_mjcf_is_what_mujoco_makes_of_it(
     check_dynamics(twins)
     if twins.entries.get("loop"):
         check_residuals(twins)
+
+
+@pytest.mark.parametrize("path", MJCF, ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_actuators_exert_the_forces_of_mujoco(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    mechanism = srm.load(path)
+    unread = [note for note in mechanism.notes if note.startswith("actuators on a tendon")]
+    assert bool(unread) == (path.stem in ("manipulator", "stacker", "point_mass"))
+    if path.stem == "point_mass":  # on tendons alone
+        assert not mechanism.actuators
+    else:
+        assert check_forces(path, mechanism) > 0.0
 
 
 @pytest.mark.parametrize("path", URDF, ids=lambda path: path.stem)

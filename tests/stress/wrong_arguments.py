@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -213,7 +213,20 @@ def calls(folder: Path) -> dict[str, Call]:
         "Mechanism": Call(
             srm.Mechanism,
             (four_bar.model, four_bar.loops),
-            {"q0": q, "v0": v, "forces": (), "drives": (), "name": "x"},
+            {"q0": q, "v0": v, "forces": (), "drives": (), "name": "x", "actuators": {}},
+        ),
+        "Actuator": Call(
+            srm.Actuator,
+            (crank,),
+            {
+                **{"type": "position", "gear": 1.0, "kp": 2.0, "kv": 0.0, "gain": None},
+                **{"bias": 0.0, "damping_ratio": 0.1, "reference": 0.0, "control_range": (0, 1)},
+                **{"force_range": None},
+            },
+        ),
+        "actuator_controller": Call(
+            srm.actuator_controller,
+            (replace(four_bar, actuators={crank: srm.Actuator(crank)}), {crank: 1.0}),
         ),
         "Anchor": Call(srm.Anchor, ("crank",), {"xyz": (0.0, 0.0, 0.0), "rpy": (0.0, 0.0, 0.0)}),
         "LoopClosure": Call(srm.LoopClosure, ("point", anchor, anchor), {"name": "x"}),

@@ -32,18 +32,34 @@ IGNORED_SECTIONS = words("size visual statistic sensor custom extension")
 BODY_READ = words("inertial joint freejoint geom site body frame replicate attach")
 BODY_IGNORED = ("camera", "light")
 PLACED = "pos quat axisangle xyaxes zaxis euler"
+ACTUATORS = words("general motor position velocity")
+"""Actuators that are read, where they act on a hinge or slide."""
+OTHER_ACTUATORS = words(
+    """intvelocity orientation pid damper cylinder muscle adhesion dcmotor plugin"""
+)
+ACTUATOR_DELAYS = words("delay nsample interp input ffrange velrange")
+"""Attributes of actuators whose outputs are not those of the control at the same time."""
+ACTUATOR = f"""name class group ctrllimited ctrlrange forcelimited forcerange gear joint
+    jointinparent tendon site refsite cranksite slidersite armature damping
+    {" ".join(ACTUATOR_DELAYS)}"""
+PARAMETERS = tuple(range(1, 11))
+"""Counts of numbers of gainprm and biasprm."""
+SERVOS = ("position", "velocity")
+KIND = "kind"
+"""Key of an actuator that has its parameters: the tag of the element that gave them."""
 ATTRIBUTES = _table(
     {
         "compiler": """angle eulerseq coordinate autolimits inertiafromgeom inertiagrouprange
             boundmass boundinertia balanceinertia settotalmass meshdir assetdir conflict""",
-        "option": "gravity wind density viscosity",
+        "option": "gravity wind density viscosity actuatorgroupdisable",
         "body": f"name childclass mocap gravcomp {PLACED}",
         "frame": f"name childclass {PLACED}",
         "replicate": "count sep offset euler",
         "attach": "model body prefix",
         "inertial": f"mass diaginertia fullinertia {PLACED}",
         "joint": """name class type pos axis springdamper stiffness range limited ref springref
-            armature damping frictionloss actuatorgravcomp""",
+            armature damping frictionloss actuatorgravcomp actuatorfrcrange
+            actuatorfrclimited""",
         "freejoint": "name",
         "geom": f"""name class type group size mass density shellinertia fromto mesh rgba material
             {PLACED}""",
@@ -57,6 +73,11 @@ ATTRIBUTES = _table(
         "material": "name class rgba",
         "model": "name file",
         "key": "name qpos qvel",
+        "general": f"""{ACTUATOR} body dyntype gaintype biastype dynprm gainprm biasprm
+            inheritrange""",
+        "motor": ACTUATOR,
+        "position": f"{ACTUATOR} kp kv dampratio timeconst inheritrange",
+        "velocity": f"{ACTUATOR} kv",
     }
 )
 """Attributes that are read; those of equalities between coordinates follow."""
@@ -70,11 +91,10 @@ IGNORED_ATTRIBUTES = _table(
         "option": """timestep apirate impratio tolerance ls_tolerance noslip_tolerance ccd_tolerance
             mpr_tolerance magnetic o_margin o_solref o_solimp o_friction integrator cone jacobian
             solver iterations ls_iterations noslip_iterations ccd_iterations mpr_iterations
-            sdf_iterations sdf_initpoints actuatorgroupdisable collision sleep_tolerance""",
+            sdf_iterations sdf_initpoints collision sleep_tolerance""",
         "body": "user sleep",
         "model": "content_type",
-        "joint": """group user margin solreflimit solimplimit solreffriction solimpfriction
-            actuatorfrcrange actuatorfrclimited""",
+        "joint": "group user margin solreflimit solimplimit solreffriction solimpfriction",
         "freejoint": "group align",
         "geom": f"""{CONTACT} contype conaffinity condim priority friction solmix hfield fitscale
             fluidshape fluidcoef""",
@@ -86,6 +106,10 @@ IGNORED_ATTRIBUTES = _table(
         "spatial": f"""{CONTACT} group limited range width material rgba actuatorfrclimited
             actuatorfrcrange solreflimit solimplimit solreffriction solimpfriction""",
         "key": "time act ctrl mpos mquat",
+        "general": "user lengthrange cranklength actdim actearly actlimited actrange",
+        "motor": "user lengthrange cranklength",
+        "position": "user lengthrange cranklength",
+        "velocity": "user lengthrange cranklength",
         "mesh": """content_type smoothnormal vertex normal texcoord face maxhullvert builtin params
             material""",
         "material": """texture texrepeat texuniform emission specular shininess reflectance metallic
@@ -94,10 +118,7 @@ IGNORED_ATTRIBUTES = _table(
 )
 GEOMS = words("sphere capsule ellipsoid cylinder box mesh plane hfield sdf")
 """Types of geom, the default first."""
-DEFAULTS_OF_OTHERS = words(
-    """camera light pair general motor position velocity intvelocity damper cylinder muscle adhesion
-    dcmotor texture"""
-)
+DEFAULTS_OF_OTHERS = (*words("camera light pair texture"), *OTHER_ACTUATORS)
 """Defaults of elements that are not read."""
 MAIN = "main"
 """The default class that all others inherit from."""
@@ -188,7 +209,11 @@ class MjcfValues(XmlValues):
         for child in node:
             if child.tag not in (*ATTRIBUTES, *DEFAULTS_OF_OTHERS, "default"):
                 raise self.fault(where, f"unknown element <{child.tag}>", "Correct its name")
-            if child.tag in ATTRIBUTES:
+            if child.tag in (*ACTUATORS, *OTHER_ACTUATORS):
+                # All kinds of actuators share one default.
+                known = mine.get("general", {})
+                mine["general"] = self.as_general(child, known, f"{where}, <{child.tag}>")
+            elif child.tag in ATTRIBUTES:
                 self.own(child, f"{where}, <{child.tag}>")
                 mine.setdefault(child.tag, {}).update(child.attrib)
         # Nested classes inherit all attributes, also those that follow them in the file.
@@ -225,6 +250,45 @@ class MjcfValues(XmlValues):
             raise self.unknown(where, f"there is no default class {name!r}", self.classes)
         defaults = self.classes[name].get(tag or node.tag, {})
         return Attributes(self, {**defaults, **given.texts}, where)
+
+    def as_general(self, node: Element, base: Mapping[str, str], where: str) -> dict[str, str]:
+        """Attributes of an actuator over those of ``base``, as MuJoCo's compiler has them: those of
+        a ``general`` one.
+
+        All kinds share their attributes.  Servos inherit the parameters of their own kind and of
+        general actuators, which are kept under keys such as ``position.gainprm``.
+        """
+        if node.tag in OTHER_ACTUATORS:
+            return {**base, **node.attrib, KIND: node.tag}
+        own = self.own(node, where)
+        given = {**base, **own.texts}
+        if node.tag == "general":
+            for key in ("gainprm", "biasprm"):
+                if key in own:
+                    given |= {f"{kind}.{key}": own.text(key) for kind in SERVOS}
+            return given
+        given[KIND] = node.tag
+        given["dyntype"] = "filterexact" if own.number("timeconst") else "none"
+        given["gaintype"], given["biastype"] = "fixed", "affine"
+        gain, bias = 1.0, np.zeros(3)
+        if node.tag in SERVOS:
+            inherited = Attributes(self, base, where)
+            gain = float(inherited.numbers(f"{node.tag}.gainprm", PARAMETERS, "1")[0])
+            gain = own.number("kp" if node.tag == "position" else "kv", gain)
+        if node.tag == "position":
+            old = inherited.numbers("position.biasprm", PARAMETERS, "0")[:3]
+            bias[: old.size] = old
+            bias[:2] = 0.0, -gain
+            if "kv" in own and "dampratio" in own:
+                raise own.fault("kv and dampratio are both given", "Keep one")
+            if "kv" in own or "dampratio" in own:  # MuJoCo tells them apart by the sign
+                bias[2] = own.number("dampratio") - own.number("kv")
+        elif node.tag == "velocity":
+            bias[2] = -gain
+        texts = {"gainprm": repr(gain), "biasprm": " ".join(map(repr, bias.tolist()))}
+        if node.tag in SERVOS:
+            given |= {f"{node.tag}.{key}": text for key, text in texts.items()}
+        return given | texts
 
     def angle(self, value: float) -> float:
         """An angle of the file in rad."""
@@ -291,6 +355,26 @@ class Attributes:
         if word not in known:
             raise self.values.unknown(self.where, f"{key} is {word!r}", known)
         return word
+
+    def limited_range(self, key: str, limited: str) -> tuple[float, float] | None:
+        """The range ``key``, where it acts by the attribute ``limited``; None without one.
+
+        Raises
+        ------
+        InputError
+            If it does not increase, or MuJoCo would not know whether it acts.
+        """
+        word = self.choice(limited, ("auto", "true", "false"))
+        if key not in self or word == "false":
+            return None
+        if word == "auto" and not self.values.compiler.autolimits:
+            raise self.fault(f"it has a {key}, but autolimits is off", f"Write {limited}")
+        low, high = self.numbers(key, 2)
+        if low == high == 0.0:
+            return None
+        if low >= high:
+            raise self.fault(f"the {key} does not increase", "Exchange the two")
+        return float(low), float(high)
 
     def flag(self, key: str, default: bool = False) -> bool:
         """``true`` or ``false``."""

@@ -69,6 +69,8 @@ class BodyReader:
         Springs of ball joints.
     references, rests
         ``ref`` and ``springref`` of the joints, by name.
+    efforts
+        Lowest and highest force of all actuators together (``actuatorfrcrange``), by joint.
     added
         Armatures of free joints by body.
     compensated
@@ -92,6 +94,7 @@ class BodyReader:
         self.forces: list[dict[str, Any]] = []
         self.references: dict[str, float] = {}
         self.rests: dict[str, float] = {}
+        self.efforts: dict[str, tuple[float, float]] = {}
         self.compensated: dict[str, float] = {}
         self.meshes: dict[str, Mesh] = dict(part.meshes)
         self.colours: dict[str, str] = dict(part.colours)
@@ -458,6 +461,9 @@ class BodyReader:
         self.rests[name] = in_si(given.number("springref"))
         rest = self.rests[name] - ref
         limits = _limits(given, in_si, ref)
+        effort = given.limited_range("actuatorfrcrange", "actuatorfrclimited")
+        if effort is not None:
+            self.efforts[name] = effort
         return replace(placed, axis=(x, y, z), rest=rest, **limits, **acting)
 
     def _spring(self, joint: Joint, stiffness: float) -> None:
@@ -515,15 +521,9 @@ def _acting(given: Attributes) -> dict[str, Any]:
 
 def _limits(given: Attributes, in_si: Callable[[float], float], ref: float) -> dict[str, Any]:
     """``lower`` and ``upper`` against the pose of the file; none without a range."""
-    word = given.choice("limited", ("auto", "true", "false"))
-    if "range" not in given or word == "false":
+    found = given.limited_range("range", "limited")
+    if found is None:
         return {}
-    if word == "auto" and not given.values.compiler.autolimits:
-        raise given.fault("it has a range, but autolimits is off", "Write limited")
-    low, high = given.numbers("range", 2)
-    if low == high == 0.0:
-        return {}
-    if low >= high:
-        raise given.fault("the range does not increase", "Exchange the two")
+    low, high = found
     clipped: FloatArray = np.clip([in_si(low) - ref, in_si(high) - ref], -OPEN_LIMIT, OPEN_LIMIT)
     return {"lower": float(clipped[0]), "upper": float(clipped[1])}

@@ -24,8 +24,8 @@ from srm_mbs.model.reach import Reach
 MOST_ATTACHED = 20_000
 """Number of elements of all attached models, which load in some seconds."""
 PREFIXED = words(
-    "name body body1 body2 joint joint1 joint2 site site1 site2 tendon tendon1 tendon2 mesh "
-    "material"
+    "name body body1 body2 joint joint1 joint2 jointinparent site site1 site2 refsite cranksite "
+    "slidersite tendon tendon1 tendon2 mesh material"
 )
 """Attributes that hold names of the file, which get its prefix."""
 IN_DEFAULTS = ("mesh", "material")
@@ -78,8 +78,8 @@ class Part:
         )
 
     def attached(self, section: str) -> Iterator[Element]:
-        """The sections of constraints or tendons, without what refers to something that is not
-        attached."""
+        """The sections of constraints, tendons or actuators, without what refers to something that
+        is not attached."""
         for node in self.root.findall(section):
             for child in list(node):
                 names = {

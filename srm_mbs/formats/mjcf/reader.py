@@ -14,6 +14,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.graph.joint_graph import ROOT_JOINT
 from srm_mbs.formats.graph.spanning_tree_to_urdf import GraphTranslator
+from srm_mbs.formats.mjcf.actuators import ActuatorReader
 from srm_mbs.formats.mjcf.attributes import MjcfValues
 from srm_mbs.formats.mjcf.bodies import BodyReader
 from srm_mbs.formats.mjcf.equality import EqualityReader
@@ -22,6 +23,8 @@ from srm_mbs.formats.mjcf.parts import main_part
 from srm_mbs.formats.translation import Options, Translation
 
 GRAVITY = "0 0 -9.81"
+GROUPS = tuple(range(1, 32))
+"""Counts of groups of actuators."""
 THIN = {"density": (2.0, "kg/m^3"), "viscosity": (1e-4, "Pa s")}
 """Media whose drag is left out, with a note: gases such as air."""
 INCLUDED = {
@@ -31,13 +34,17 @@ INCLUDED = {
 """Flags that disable several kinds of force, and those kinds."""
 
 
-def _option(values: MjcfValues, nodes: list[Element]) -> FloatArray:
-    """Gravity (3,); kinds of force that are switched off go into ``values``."""
+def _option(values: MjcfValues, nodes: list[Element]) -> tuple[FloatArray, set[int]]:
+    """Gravity (3,), and the groups of actuators that are switched off; kinds of force that are
+    go into ``values``."""
     gravity = GRAVITY
+    groups: set[int] = set()
     for node in nodes:
         given = values.own(node, "<option>")
         values.children(node, "<option>", ("flag",), ())
         gravity = given.text("gravity", gravity)
+        if given.text("actuatorgroupdisable"):
+            groups |= set(map(int, given.numbers("actuatorgroupdisable", GROUPS).tolist()))
         for key, (most, unit) in THIN.items():
             if given.number(key) > most:
                 problem = f"the drag of a medium does not act, and its {key} is above {most} {unit}"
@@ -49,7 +56,7 @@ def _option(values: MjcfValues, nodes: list[Element]) -> FloatArray:
             values.off |= off.union(*(INCLUDED.get(key, ()) for key in off))
     if "gravity" in values.off:
         gravity = "0 0 0"
-    return values.numbers(gravity, 3, "<option>", "gravity")
+    return values.numbers(gravity, 3, "<option>", "gravity"), groups
 
 
 def translate(document: Document, options: Options) -> Translation:
@@ -78,7 +85,7 @@ def translate(document: Document, options: Options) -> Translation:
         raise values.fault(
             "cut", "the joints of an MJCF file are a tree: nothing is to be cut", "Remove cut"
         )
-    gravity = _option(values, root.findall("option"))
+    gravity, disabled = _option(values, root.findall("option"))
     tree = BodyReader(part, options.reach)
     for node in root.findall("worldbody"):
         tree.world(node)
@@ -90,13 +97,14 @@ def translate(document: Document, options: Options) -> Translation:
     closures = EqualityReader(tree)
     for each in tree.parts:
         closures.read(each)
-    for tag, why in (
-        ("contact", "contact between bodies does not act"),
-        ("actuator", "actuators give no force"),
-    ):
-        count = sum(len(node) for each in tree.parts for node in each.root.findall(tag))
-        if count:
-            values.remark(why, f"{count} element(s) of <{tag}> ignored")
+    actuators = ActuatorReader(tree, closures.lock, disabled)
+    for each in tree.parts:
+        actuators.read(each)
+    actuators.finish()
+    pairs = sum(len(node) for each in tree.parts for node in each.root.findall("contact"))
+    if pairs:
+        why = "contact between bodies does not act"
+        values.remark(why, f"{pairs} element(s) of <contact> ignored")
     root_body = next(iter(tree.free), next(iter(tree.bodies)))
     graph = GraphTranslator(
         file,
@@ -121,6 +129,7 @@ def translate(document: Document, options: Options) -> Translation:
         gravity=gravity.tolist(),
         loop=closures.loops,
         force=[*tree.forces, *closures.forces],
+        actuators=actuators.actuators,
         gravity_compensation=tree.compensated,
         lock=closures.lock,
         initial=start,

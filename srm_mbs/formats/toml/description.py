@@ -28,6 +28,7 @@ from srm_mbs.formats.toml.schema import (
     TopEntry,
 )
 from srm_mbs.formats.translation import MODEL_KEYS, PLANAR
+from srm_mbs.model.actuators import Actuator, naming_actuator
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure
 from srm_mbs.model.drives import Drive
@@ -79,9 +80,11 @@ class Description(TopEntry):
                 )
 
     def coupled_joints(self) -> frozenset[str]:
-        """Names of the joints that take part in a coupling, or in a spring on several joints."""
+        """Names of the joints whose angles count turns: those that take part in a coupling, or in a
+        spring on several joints, or have a position servo."""
         together = [*self.loop, *(entry for entry in self.force if hasattr(entry, "joints"))]
-        return frozenset(name for entry in together for name in entry.joints or ())
+        servos = {entry.joint for entry in self.actuators.values() if entry.kp}
+        return frozenset(servos).union(*(entry.joints or () for entry in together))
 
     def with_locked(self, joints: Collection[str]) -> Self:
         """The same description with ``joints`` locked as well, and without their couplings."""
@@ -107,6 +110,26 @@ class Description(TopEntry):
             For an anchor without link or frame.
         """
         return {name: _anchor(f"points.{name}", "", entry) for name, entry in self.points.items()}
+
+    def named_actuators(self) -> tuple[dict[str, Actuator], tuple[str, ...]]:
+        """The actuators of ``[actuators]`` by name, without those of locked joints, and a note
+        about these.
+
+        Raises
+        ------
+        InputError
+            For a value that an actuator cannot take.
+        """
+        found: dict[str, Actuator] = {}
+        for name, entry in self.actuators.items():
+            with naming_actuator(name):
+                found[name] = Actuator(**dict(entry))
+        idle = [name for name, actuator in found.items() if actuator.joint in self.lock]
+        if not idle:
+            return found, ()
+        return {name: one for name, one in found.items() if name not in idle}, (
+            f"actuators of joints that are locked are left out: {', '.join(map(repr, idle))}",
+        )
 
     def force_elements(self, tables: CsvFolder | None) -> tuple[ForceElement, ...]:
         """The force elements; without ``tables`` those that follow a law are left out.

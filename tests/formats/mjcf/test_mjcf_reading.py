@@ -76,7 +76,7 @@ def test_included_files_stand_in_the_place_of_the_include(tmp_path: Path) -> Non
 def test_what_gives_no_force_is_noted() -> None:
     more = (
         '<option density="1.2" viscosity="1.8e-5"/>'
-        '<actuator><motor joint="j"/></actuator><sensor/>'
+        '<actuator><muscle joint="j"/></actuator><sensor/>'
         '<contact><exclude body1="one" body2="two"/></contact>'
         '<equality><weld body1="one" body2="two" torquescale="2" solref="0.1 1"/></equality>'
     )

@@ -6,8 +6,8 @@ import ast
 import inspect
 import json
 import re
-import tomllib
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -17,75 +17,58 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
-from PIL import Image
+from defusedxml.ElementTree import fromstring
+from PIL import Image, ImageSequence
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import closure_errors
 from srm_mbs.formats.toml.description import check_description, parse_toml
 from srm_mbs.formats.toml.parameters import resolved
-from tools import plot_pictures, singular_pictures
+from tools import closure_sketches, plot_pictures, singular_pictures, tutorials
 from tools.method_tables import filled
+from tools.pages import DOCS, PRINTS, ROOT, blocks, is_whole, run_page, with_printed
 from tools.singular_pictures import by_scipy
 
-ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
 SOURCE = ROOT / "srm_mbs"
 PAGES = {
-    page.name: page.read_text(encoding="utf-8")
-    for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
+    "README.md": (ROOT / "README.md").read_text(encoding="utf-8"),
+    **{
+        page.relative_to(DOCS).as_posix(): page.read_text(encoding="utf-8")
+        for page in sorted(DOCS.rglob("*.md"))
+    },
 }
-"""Text of each page, by the name of its file."""
-FENCE = re.compile(r"^```(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-LANGUAGES = {"python", "toml", "sh", ""}
+"""Text of each page, by the name of its file, relative to docs/."""
+TUTORIALS = [page for page in PAGES if page.startswith("tutorials/")]
+LANGUAGES = {"python", "toml", "xml", "sh", ""}
 """Of fenced blocks; one in another language would be run by no test."""
 Ran = Callable[[str], tuple[dict[str, Any], Path]]
 
 
-@cache
-def blocks(page: str) -> tuple[tuple[str, str], ...]:
-    """Language and text of the fenced blocks of a page."""
-    return tuple(FENCE.findall(PAGES[page]))
-
-
-def is_whole(text: str) -> bool:
-    """Whether a TOML block is a whole description, and not some tables of one."""
-    return text.lstrip().startswith(("format", "#")) and "\nformat = " in f"\n{text}"
-
-
-def describe(text: str, folder: Path) -> None:
-    """Load a description as ``folder/[models/]NAME.toml``, where it finds its URDF."""
-    named = re.match(r"# (\S+\.toml)\n", text)
-    path = folder / (named[1] if named else f"models/{tomllib.loads(text)['name']}.toml")
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-    if not named:
-        (folder / "urdf").symlink_to(ROOT / "urdf")
-    srm.load(path)
-
-
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
-    """Run the blocks of a page, once: what they left behind, and their folder."""
+def outcome(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Any]:
+    """Run the blocks of a page, once: what they left behind, their folder, what they printed."""
 
     @cache
-    def run(page: str) -> tuple[dict[str, Any], Path]:
+    def run(page: str) -> tuple[dict[str, Any], Path, list[str]]:
         folder = tmp_path_factory.mktemp("page")
-        names: dict[str, Any] = {"__name__": "page"}
-        with pytest.MonkeyPatch.context() as patch:
-            patch.chdir(folder)
-            for number, (language, text) in enumerate(blocks(page), start=1):
-                if language == "python":
-                    code = compile(text, f"{page}, block {number}", "exec", dont_inherit=True)
-                    exec(code, names)
-                elif language == "toml" and is_whole(text):
-                    describe(text, folder)
-        return names, folder
+        names, printed = run_page(PAGES[page], page, folder)
+        return names, folder, printed
 
     return run
 
 
+@pytest.fixture(scope="module")
+def ran(outcome: Callable[[str], Any]) -> Ran:
+    """What the blocks of a page left behind, and their folder."""
+    return lambda page: outcome(page)[:2]
+
+
 def with_code() -> list[str]:
-    return [page for page in PAGES if any(kind in ("python", "toml") for kind, _ in blocks(page))]
+    return [
+        page
+        for page, text in PAGES.items()
+        if any(kind in ("python", "toml") for kind, _ in blocks(text))
+    ]
 
 
 @pytest.mark.parametrize("page", with_code())
@@ -99,15 +82,15 @@ def test_the_blocks_of_a_page_run_in_order(page: str, ran: Ran) -> None:
 @pytest.mark.parametrize("page", PAGES)
 def test_every_block_of_a_page_is_in_a_language_that_is_known_here(page: str) -> None:
     text = PAGES[page]
-    assert {language for language, _ in blocks(page)} <= LANGUAGES
-    assert 2 * len(blocks(page)) == text.count("```")
+    assert {language for language, _ in blocks(PAGES[page])} <= LANGUAGES
+    assert 2 * len(blocks(PAGES[page])) == text.count("```")
 
 
 def fragments() -> list[tuple[str, str]]:
     return [
         (page, text)
         for page in PAGES
-        for language, text in blocks(page)
+        for language, text in blocks(PAGES[page])
         if language == "toml" and not is_whole(text)
     ]
 
@@ -139,7 +122,14 @@ def test_the_site_leads_to_every_page() -> None:
         return [page for part in parts for page in pages(part)]
 
     listed = pages(yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"])
-    assert sorted(listed) == sorted(page.name for page in DOCS.glob("*.md"))
+    assert sorted(listed) == sorted(set(PAGES) - {"README.md"})
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_pictures_that_a_page_shows_are_there(page: str) -> None:
+    folder = ROOT if page == "README.md" else (DOCS / page).parent
+    shown = re.findall(r"!\[[^\]]*\]\(([^)#]+)\)", PAGES[page])
+    assert [path for path in shown if not (folder / path).is_file()] == []
 
 
 def test_the_page_of_the_api_has_every_public_name() -> None:
@@ -197,13 +187,101 @@ def test_the_linkage_in_the_readme_turns_fully_and_is_saved(ran: Ran) -> None:
 
 
 def test_the_readme_starts_with_exactly_two_commands() -> None:
-    language, first = blocks("README.md")[0]
+    language, first = blocks(PAGES["README.md"])[0]
     commands = [line for line in first.splitlines() if line and not line.startswith("#")]
     assert language == "sh"
     assert len(commands) == 2
     assert "pip install ." in commands[0]
     assert "srm-mbs simulate slider_crank" in commands[0]
     assert commands[1] == "tests/run"
+
+
+# --- the tutorials -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("page", [*TUTORIALS, "machine_design.md"])
+def test_what_a_page_shows_below_a_block_is_what_the_block_prints(
+    page: str, outcome: Callable[[str], Any]
+) -> None:
+    text = PAGES[page]
+    assert len(PRINTS.findall(text)) > 5
+    assert with_printed(text, outcome(page)[2]) == text, "run python -m tools.tutorials"
+
+
+@pytest.mark.parametrize("page", TUTORIALS)
+def test_a_tutorial_writes_its_figures_and_its_animation(page: str, ran: Ran) -> None:
+    _, folder = ran(page)
+    for name in re.findall(r'"(\w+\.pdf)"', PAGES[page]):
+        head = (folder / name).read_bytes()[:5]
+        assert head == b"%PDF-", name
+    (frame,) = re.findall(r'<iframe src="(\w+\.html)"', PAGES[page])
+    assert (folder / frame).stat().st_size > 500_000
+
+
+@pytest.mark.parametrize("page", TUTORIALS)
+def test_the_pictures_of_a_tutorial_are_those_of_its_code(
+    page: str, ran: Ran, tmp_path: Path
+) -> None:
+    names, _ = ran(page)
+    tutorials.draw(Path(page).stem, names, tmp_path)
+    for new in tmp_path.iterdir():
+        with Image.open(new) as drawn, Image.open(DOCS / "tutorials" / new.name) as committed:
+            assert drawn.size == committed.size, new.name
+            difference = np.subtract(
+                *(np.asarray(x.convert("L"), float) for x in (drawn, committed))
+            )
+        assert np.abs(difference).mean() < 2.0, f"{new.name}: run python -m tools.tutorials"
+    shown = re.findall(r"\((\w+\.png)\)", PAGES[page])
+    assert sorted(shown) == sorted(path.name for path in tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("page", TUTORIALS)
+def test_the_film_of_a_tutorial_moves_and_is_small(page: str) -> None:
+    path = DOCS / page.replace(".md", ".gif")
+    assert path.stat().st_size < 200_000
+    with Image.open(path) as film:
+        frames = [np.asarray(frame.convert("L"), float) for frame in ImageSequence.Iterator(film)]
+    assert len(frames) > 20
+    assert all(np.abs(b - a).max() > 50.0 for a, b in pairwise(frames))
+
+
+def test_the_work_of_the_motor_in_the_press_is_that_on_the_workpiece(ran: Ran) -> None:
+    names, _ = ran("tutorials/press.md")
+    run = names["run"]
+    turn, torque = run.joint("O")[0], run.drive_forces["O"]
+    assert np.trapezoid(torque, turn) == pytest.approx(0.5 * 60e3 * 4e-3, rel=1e-3)
+
+
+def test_the_pin_forces_of_the_press_are_those_of_its_statics(ran: Ran) -> None:
+    """Turned slowly and without weight, the knee carries what a triangle of forces says."""
+    names, _ = ran("tutorials/press.md")
+    machine, ram = names["machine"], names["ram"]
+    model = machine.model.copy()
+    model.gravity.linear = np.zeros(3)
+    slow = replace(machine, model=model, drives=[srm.Drive(srm.ConstantSpeed(1e-3), joint="O")])
+    place = srm.assemble(slow, {"O": np.radians(160.0)}, {"O": 1e-3})
+    slow = slow.with_state(place.q, place.v)
+    run = srm.simulate(slow, 1.0, controller=names["workpiece"], t_eval=[0.0, 1.0])
+    knee, pin = (run.point(machine.points[name]).position[:, [0, 2]] for name in "KD")
+    slope = np.arctan2(*np.abs(knee - pin).T)
+    load = 60e3 * (1.0 - (run.joint("ram")[0] - ram.lower) / 4e-3)
+    found = np.linalg.norm(run.reactions["D"][:, :3], axis=1)
+    np.testing.assert_allclose(found, load / np.cos(slope), rtol=1e-6)
+
+
+def test_the_rod_of_the_leg_balances_the_torque_about_the_knee(ran: Ran) -> None:
+    """The shank alone: force of the rod times its distance from the knee is the knee's torque."""
+    names, _ = ran("tutorials/leg.md")
+    run, needed, direct = names["squat"], names["geared"], names["direct"]
+    rod, lever, knee = (
+        run.point(srm.Anchor(link, xyz=xyz)).position
+        for link, xyz in (("rod", (0, 0, 0)), ("shank", (-0.02, 0, -0.035)), ("shank", (0, 0, 0)))
+    )
+    pull = needed.reactions["rod_pin"][:, :3]
+    torque = -np.cross(lever - knee, pull)[:, 1]
+    # The rod has mass: without it the two agree exactly.
+    np.testing.assert_allclose(torque, direct.torques[:, 1], rtol=0.02, atol=0.3)
+    assert np.linalg.norm(lever - rod, axis=1) == pytest.approx(0.25)
 
 
 # --- what single pages promise -------------------------------------------------------------------
@@ -298,6 +376,19 @@ def test_the_pictures_of_a_page_can_be_drawn_again(
             assert new.size == old.size, name
             assert np.std(np.asarray(new.convert("L"), dtype=float)) > 5.0, f"{name} is blank"
     assert sum(path.stat().st_size for path in (DOCS / folder).iterdir()) < 150_000
+
+
+def test_the_page_on_closures_has_a_sketch_of_every_type(tmp_path: Path) -> None:
+    closure_sketches.draw(tmp_path)
+    shown = re.findall(r"\(closures/(\w+)\.svg\)<br>`(\w+)`", PAGES["closures.md"])
+    assert [picture for picture, _ in shown] == [name for _, name in shown]
+    assert sorted(name for _, name in shown) == sorted(srm.CLOSURE_TYPES)
+    drawn = {path.name: path.read_text(encoding="utf-8") for path in tmp_path.iterdir()}
+    committed = (DOCS / "closures").iterdir()
+    assert drawn == {path.name: path.read_text(encoding="utf-8") for path in committed}
+    for text in drawn.values():
+        assert "prefers-color-scheme:dark" in text
+        assert fromstring(text).tag.endswith("svg")
 
 
 # --- docstrings on the site ----------------------------------------------------------------------

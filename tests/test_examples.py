@@ -11,8 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.notebooks import executed_cells, printed
+from tools import tutorials
+from tools.pages import DOCS, PRINTS
+
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+TUTORIALS = sorted(tutorials.PICTURES)
 Ran = Callable[[str], tuple[str, Path]]
 
 
@@ -105,3 +110,28 @@ def test_the_sweep_finds_which_cases_overload_the_pin(ran: Ran) -> None:
     again = run(ROOT / "examples" / "parameter_sweep.py", folder)
     assert "3 failures, 9 resumed" in again
     assert again.splitlines()[1:] == output.splitlines()[1:]
+
+
+# --- the notebooks of the tutorials --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", TUTORIALS)
+def test_the_notebook_of_a_tutorial_has_the_steps_of_its_page(name: str) -> None:
+    text = (DOCS / "tutorials" / f"{name}.md").read_text(encoding="utf-8")
+    committed = (ROOT / "examples" / f"{name}_notebook.ipynb").read_text(encoding="utf-8")
+    assert committed == tutorials.notebook(name, text), "run python -m tools.tutorials"
+
+
+@pytest.mark.parametrize("name", TUTORIALS)
+def test_the_notebook_of_a_tutorial_prints_and_draws_what_its_page_shows(
+    name: str, tmp_path: Path
+) -> None:
+    text = (DOCS / "tutorials" / f"{name}.md").read_text(encoding="utf-8")
+    cells = executed_cells(ROOT / "examples" / f"{name}_notebook.ipynb", tmp_path)
+    said = [printed(cell) for cell in cells if "%%writefile" not in cell["source"][0]]
+    assert [text for text in said if text] == [shown for _, shown, _ in PRINTS.findall(text)]
+    given = {"".join(cell["source"]): cell["outputs"] for cell in cells}
+    for variable in tutorials.PICTURES[name].values():
+        assert [out for out in given[variable] if "image/png" in out["data"]], variable
+    (view,) = (outputs for source, outputs in given.items() if source.endswith(".show()"))
+    assert [out for out in view if "text/html" in out["data"]]

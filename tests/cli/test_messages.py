@@ -303,7 +303,7 @@ def test_verbose_shows_the_log_and_without_it_nothing_of_it_is_seen() -> None:
     assert quiet.stderr == ""
 
 
-PAGES = (PACKAGE.parent / "README.md", *sorted((PACKAGE.parent / "docs").glob("*.md")))
+PAGES = (PACKAGE.parent / "README.md", *sorted((PACKAGE.parent / "docs").rglob("*.md")))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +9,10 @@ import pytest
 
 import srm_mbs as srm
 from tests.support.browsing import LARGE, assert_in_place, opened
+from tests.support.notebooks import code_cells, executed_cells
 
 ROOT = Path(__file__).parents[3]
 NOTEBOOK = ROOT / "examples" / "slider_crank_notebook.ipynb"
-
-
-def code_cells(path: Path) -> list[dict[str, Any]]:
-    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-    return [cell for cell in cells if cell["cell_type"] == "code"]
 
 
 def output(cell: dict[str, Any], kind: str) -> str:
@@ -31,20 +24,7 @@ def output(cell: dict[str, Any], kind: str) -> str:
 @pytest.fixture(scope="module")
 def executed(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     """The code cells, each with what it gave."""
-    folder = tmp_path_factory.mktemp("notebook")
-    names = ("HOME", "IPYTHONDIR", "JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR")
-    target = folder / "run"
-    done = subprocess.run(
-        [sys.executable, "-m", "jupyter", "execute", "--output", str(target), str(NOTEBOOK)],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
-        | {name: str(folder) for name in names},
-    )
-    assert done.returncode == 0, done.stderr
-    return code_cells(folder / "run.ipynb")
+    return executed_cells(NOTEBOOK, tmp_path_factory.mktemp("notebook"))
 
 
 def test_the_committed_notebook_is_short_and_holds_no_outputs() -> None:

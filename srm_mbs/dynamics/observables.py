@@ -14,7 +14,9 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.rheonomic import all_rows, constraint_errors
+from srm_mbs.dynamics.constraints.row_algebra import SingularValues
 from srm_mbs.dynamics.forces import ForceKinematics
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.model.forces import Bushing, ForceElement, SpringDamper, TorsionSpring
@@ -84,6 +86,18 @@ class Observables:
             if mechanism.drives:
                 out[i, :, -1] = -rows.target_rate
         return out
+
+    def smallest_values(
+        self,
+        geometry: ClosureGeometry,
+        values: SingularValues,
+        k: int,
+        t: FloatArray,
+        q: FloatArray,
+    ) -> FloatArray:
+        """The k-th largest singular values (n,), k from 1, of the separated rows of ``geometry``;
+        ``values`` has the places of their entries."""
+        return values(geometry.separated_rows(self.jacobians(t, q)), k)
 
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         """Kinetic and potential energy (n, 2) J: of the bodies; of gravity, springs and

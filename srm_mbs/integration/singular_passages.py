@@ -23,7 +23,10 @@ import numpy as np
 
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.dynamics.constraints.geometry import separated_pattern
-from srm_mbs.dynamics.constraints.row_algebra import SingularValues
+from srm_mbs.dynamics.constraints.row_algebra import (
+    SingularValues,
+    active_rows,
+)
 from srm_mbs.dynamics.constraints.structure import SMALL_REFERENCE_PIVOT
 from srm_mbs.dynamics.singularities.branches import branch_tangents
 from srm_mbs.dynamics.singularities.critical import CriticalConfiguration, critical_configuration
@@ -132,11 +135,20 @@ class ConstraintMonitor:
 
     def smallest(self, t: FloatArray) -> FloatArray:
         """Last structural singular value of the normalised G at the times t (k,)."""
-        return self._values(self.geometry.separated_rows(self._jacobians(t)), self.rank)
+        if not len(t):
+            return np.zeros(0)
+        q = self._dense(t)[:, : self.geometry.model.nq]
+        observables = self._dense.observables
+        return observables.smallest_values(self.geometry, self._values, self.rank, t, q)
 
     def normalised(self, t: FloatArray) -> FloatArray:
         """The normalised G (k, rows, n) at the times t (k,)."""
         return self.geometry.normalised_rows(self._jacobians(t))
+
+    def near_null_spaces(self, G: FloatArray, active: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Those of the ``active`` rows G (k, n) of the normalised ones that vanish at a singular
+        configuration, left (k, k - r) and right (n, n - r)."""
+        return self._values.of_rows(active).near_null_spaces(G, self.rank)
 
     def _jacobians(self, t: FloatArray) -> FloatArray:
         q = self._dense(t)[:, : self.geometry.model.nq]
@@ -475,9 +487,11 @@ def _rank_loss_cosine(
         if not np.linalg.norm(geometry.difference(q, found)) < CLOSE_DISTANCE * moved:
             return None
         G = geometry.normalised(found)
-    left, size, right = np.linalg.svd(G)
-    rank = int(np.sum(size > max(100.0 * size[monitor.rank - 1], 1e-9)))
-    a, b = ((left[:, rank:].T @ other @ right[rank:].T).ravel() for other in (G_before, G_after))
+    # Rows that are zero in all of them have no part.
+    active = active_rows(np.hstack([G, G_before, G_after]))
+    G, G_before, G_after = (rows[active] for rows in (G, G_before, G_after))
+    left, right = monitor.near_null_spaces(G, active)
+    a, b = ((left.T @ other @ right).ravel() for other in (G_before, G_after))
     return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
 
 

@@ -21,6 +21,7 @@
 #include "linear.hpp"
 #include "model.hpp"
 #include "run.hpp"
+#include "separated_rows.hpp"
 #include "struct_binding.hpp"
 
 using namespace srm;
@@ -106,6 +107,7 @@ void bind_structs(nb::module_& m) {
     bind_struct<Elimination>(m, "Elimination");
     bind_struct<DrivenRow>(m, "DrivenRow");
     bind_struct<SystemData>(m, "SystemData");
+    bind_struct<SeparatedRows>(m, "SeparatedRows");
     bind_struct<Extension>(m, "Extension");
     bind_struct<DenseConstants>(m, "DenseConstants");
     bind_struct<BranchCurve>(m, "BranchCurve");
@@ -219,6 +221,21 @@ struct PySystem {
         return owned_array(std::move(G), {n, rows, static_cast<std::size_t>(width)});
     }
 
+    // The smallest singular value (n,) of the separated rows; see SeparatedRows::smallest.
+    nb::object smallest_values(const SeparatedRows& rows, Algebra& algebra, const Array& t,
+                               const Array& q) {
+        const std::size_t n = count_of(t, q, system->nq), all = system->rows();
+        const std::size_t width = system->nv + (system->driven() ? 1 : 0);
+        if (rows.supports.size() != all || rows.factors.size() != all * width ||
+            static_cast<int>(rows.active.size()) != algebra.rows() ||
+            static_cast<int>(width) != algebra.columns())
+            throw nb::value_error("the rows are not those of the system and of the algebra");
+        std::vector<double> out(n), G(all * width);
+        for (std::size_t i = 0; i < n; ++i)
+            out[i] = rows.smallest(*system, algebra, t.data()[i], q.data() + i * system->nq, G);
+        return owned_array(std::move(out));
+    }
+
     // Kinetic and potential energy (n, 2).
     nb::object energies(const Array& states) {
         const std::size_t nx = state_size();
@@ -290,6 +307,7 @@ void bind_system(nb::module_& m) {
              })
         .def("closure_errors", &PySystem::closure_errors)
         .def("jacobians", &PySystem::jacobians)
+        .def("smallest_values", &PySystem::smallest_values)
         .def("energies", &PySystem::energies)
         .def("powers", &PySystem::powers, nb::arg("t"), nb::arg("states"), nb::arg("elements"),
              nb::arg("resting"))

@@ -54,6 +54,11 @@ void Projection::white_project(const double* w, double* white) const {
     }
 }
 
+void Projection::inverse_gram(const double* g, double* out) const {
+    normal(g, work_.data());
+    multiplier(work_.data(), out);
+}
+
 void Projection::hold(const double* normals, int count) {
     const int missing = std::min(structural_rank - rank, count);
     held_.resize(static_cast<std::size_t>(missing) * nv);

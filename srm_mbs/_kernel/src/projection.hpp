@@ -43,6 +43,8 @@ public:
     void white_project(const double* w, double* white) const;
     // g = Pi R^-1 Q^T x, the transpose of normal(): zero in the rows that are not in use.
     virtual void multiplier(const double* white, double* g) const = 0;
+    // out = (W^T W)^-1 g (rows,) = Pi R^-1 R^-T Pi^T g, zero in the rows that are not in use.
+    virtual void inverse_gram(const double* g, double* out) const;
     // Subtracts Q Q^T x from x, in place.
     virtual void remove_normal(double* white) const = 0;
     // x = L^-1 x, x = L^T x and x = L^-T x, in place.

@@ -90,6 +90,7 @@ SparseProjection::SparseProjection(int structural_rank, double sigma_ref, const 
       changed_(words_for(rows)),
       along_(rows),
       scratch_(rows),
+      solved_(structural_rank),
       diagonal_(nv),
       inverse_(nv),
       place_of_(rows),
@@ -504,17 +505,28 @@ void SparseProjection::times_q(double* x) const {
     }
 }
 
-void SparseProjection::normal(const double* g, double* white) const {
+template <class Solved>
+void SparseProjection::forward(const double* g, Solved solved) const {
     double* left = scratch_.data();
     std::copy(g, g + rows, left);
-    std::fill(white, white + nv, 0.0);
     for (int k = 0; k < rank; ++k) {
         const double z = left[order_[k]] / right_diagonal_[k];
-        white[pivot_row_[k]] = z;
+        solved(k, z);
         const int start = right_start_[k];
         scattered(-z, right_.data() + start, right_column_.data() + start,
                   right_start_[k + 1] - start, left);
     }
+}
+
+double SparseProjection::beside_diagonal(int k, const double* g) const {
+    const int start = right_start_[k];
+    return gathered(right_.data() + start, right_column_.data() + start,
+                    right_start_[k + 1] - start, g);
+}
+
+void SparseProjection::normal(const double* g, double* white) const {
+    std::fill(white, white + nv, 0.0);
+    forward(g, [&](int k, double z) { white[pivot_row_[k]] = z; });
     times_q(white);
 }
 
@@ -522,12 +534,17 @@ void SparseProjection::multiplier(const double* white, double* g) const {
     std::vector<double> x(white, white + nv);
     times_q_transposed(x.data());
     std::fill(g, g + rows, 0.0);
-    for (int k = rank - 1; k >= 0; --k) {
-        const int start = right_start_[k];
-        const double known = gathered(right_.data() + start, right_column_.data() + start,
-                                      right_start_[k + 1] - start, g);
-        g[order_[k]] = (x[pivot_row_[k]] - known) / right_diagonal_[k];
-    }
+    for (int k = rank - 1; k >= 0; --k)
+        g[order_[k]] = (x[pivot_row_[k]] - beside_diagonal(k, g)) / right_diagonal_[k];
+}
+
+// Q drops out.
+void SparseProjection::inverse_gram(const double* g, double* out) const {
+    double* z = solved_.data();
+    forward(g, [&](int k, double value) { z[k] = value; });
+    std::fill(out, out + rows, 0.0);
+    for (int k = rank - 1; k >= 0; --k)
+        out[order_[k]] = (z[k] - beside_diagonal(k, out)) / right_diagonal_[k];
 }
 
 void SparseProjection::keep_normal(double* white) const {

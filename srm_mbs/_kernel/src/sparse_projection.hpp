@@ -37,6 +37,7 @@ public:
     double* filled(int row) override { return column(row); }
     void normal(const double* g, double* white) const override;
     void multiplier(const double* white, double* g) const override;
+    void inverse_gram(const double* g, double* out) const override;
     void remove_normal(double* white) const override;
     void whiten_force(double* x) const override;
     void whiten_velocity(double* x) const override;
@@ -75,7 +76,7 @@ protected:
     BitSets rows_of_, columns_of_;
     std::vector<Word> open_rows_, open_columns_, changed_;
     std::vector<double> along_;
-    mutable std::vector<double> scratch_;
+    mutable std::vector<double> scratch_, solved_;
 
 private:
     void factorise(const double* M, const double* f, const double* bias, double floor) override;
@@ -94,6 +95,11 @@ private:
         return &A_[static_cast<std::size_t>(place) * row_count_];
     }
     void clear();
+    // Row k of R times g, without the diagonal.
+    double beside_diagonal(int k, const double* g) const;
+    // Solves R^T z = Pi^T g: `solved(k, z_k)` for each k in turn.
+    template <class Solved>
+    void forward(const double* g, Solved solved) const;
     void times_q(double* x) const;
     void times_q_transposed(double* x) const;
 

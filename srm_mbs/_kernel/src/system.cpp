@@ -1107,14 +1107,18 @@ void System::powers(double t, const double* state, const std::vector<ForceElemen
 }
 
 void System::closures_at(double t, const double* q, double* g, double* G, int width) {
+    std::fill_n(G, static_cast<std::size_t>(data_.rows) * width, 0.0);
+    write_rows(t, q, G, width);
+    std::copy(g_.begin(), g_.end(), g);
+}
+
+void System::write_rows(double t, const double* q, double* G, int width) {
     auto& w = *work_;
     t = std::min(std::max(t, first_), last_);
     std::copy(q, q + nq, w.q.data());
     pinocchio::computeJointJacobians(w.model, w.data, Argument(w.q));
     update_closures(q, false);
     update_drives(t, false);
-    std::copy(g_.begin(), g_.end(), g);
-    std::fill_n(G, static_cast<std::size_t>(data_.rows) * width, 0.0);
     const auto copy = [&](int row, int j) { G[row * width + j] = filled(row)[j]; };
     for (const ClosureRows& closure : data_.closures)
         for (std::size_t k = 0; k < closure.count(); ++k)

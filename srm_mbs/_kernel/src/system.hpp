@@ -211,6 +211,8 @@ public:
     // All rows at q and t, without velocities: g (rows,), and by rows G (rows, width) with the
     // derivative by t, where drives are, as its last column.
     void closures_at(double t, const double* q, double* g, double* G, int width);
+    // The entries of these rows that may differ from zero, into G.
+    void write_rows(double t, const double* q, double* G, int width);
     // The coordinates that their differences may move together.
     const ColumnGroups& column_groups();
     int rows() const { return data_.rows; }

@@ -118,8 +118,9 @@ class ClosureGeometry:
         return self.closure(q)[1] / self.row_size[:, None]
 
     @cached_property
-    def _shares(self) -> list[tuple[int, int, float]]:
-        """The eliminations of the load-time analysis, between normalised rows."""
+    def shares(self) -> list[tuple[int, int, float]]:
+        """The eliminations of the load-time analysis, between normalised rows: (row, other, share
+        of the other row in the row)."""
         eliminations = structure_of(self.mechanism).eliminations
         if not eliminations:
             return []
@@ -129,12 +130,12 @@ class ClosureGeometry:
     def _without_shares(self, normalised: FloatArray) -> FloatArray:
         """``normalised`` rows (..., rows, n) after the eliminations."""
         G = normalised.copy()
-        for row, other, share in self._shares:
+        for row, other, share in self.shares:
             G[..., row, :] -= share * G[..., other, :]
         return G
 
     @cached_property
-    def _left(self) -> FloatArray:
+    def left(self) -> FloatArray:
         """Norm of each row (rows,) after the eliminations, over that before them, at q0."""
         normalised = self.normalised(self.at(self.mechanism.q0, 0.0))
         before, left = (
@@ -146,9 +147,9 @@ class ClosureGeometry:
         return shares
 
     def _separate(self, normalised: FloatArray) -> FloatArray:
-        if not self._shares:
+        if not self.shares:
             return normalised
-        out: FloatArray = self._without_shares(normalised) / self._left[:, None]
+        out: FloatArray = self._without_shares(normalised) / self.left[:, None]
         return out
 
     def separated(self, q: FloatArray) -> FloatArray:
@@ -161,10 +162,10 @@ class ClosureGeometry:
     def normalised_rows(self, jacobians: FloatArray) -> FloatArray:
         """As :meth:`normalised`, from the rows (..., rows, n) of unscaled Jacobians, of closures
         and drives (:meth:`srm_mbs.dynamics.observables.Observables.jacobians`)."""
-        return jacobians * self._row_factors
+        return jacobians * self.row_factors
 
     @cached_property
-    def _row_factors(self) -> FloatArray:
+    def row_factors(self) -> FloatArray:
         """Factors (rows, n) from entries of G to those of normalised rows."""
         return self.unit / (self.row_unit * self.row_size)[:, None]
 

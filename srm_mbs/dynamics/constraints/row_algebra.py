@@ -25,7 +25,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -54,6 +54,18 @@ tenth of the time of calls of LAPACK where these are few."""
 
 SPARSE_ABOVE = 64
 """Columns above which singular values come from a sparse factorisation."""
+
+COMPILED_ABOVE = 16
+"""Columns above which singular values along a motion come from factorisations on the kernel."""
+
+CLEAR_GAP = 100.0
+"""Ratio of neighbouring pivots from which the rows of the smaller ones depend on the others."""
+
+VANISHING = 100.0
+"""Singular values up to this multiple of the smallest vanish with it."""
+
+LEAST_VALUE = 1e-9
+"""Singular values below this vanish."""
 
 LARGEST_FILL = 0.5
 """Largest part of the entries of W that are not zero for which an order is computed."""
@@ -292,9 +304,26 @@ class CompiledAlgebra:
         :meth:`solve` where M = 1."""
         return self._algebra.multiplier(np.ascontiguousarray(white))  # type: ignore[no-any-return]
 
+    @property
+    def compiled(self) -> Any:
+        """The kernel's own."""
+        return self._algebra
+
+    def combinations(self, G: FloatArray) -> FloatArray:
+        """Of each row of G (rows, nv), which was factorised with M = 1, the combination (rows,
+        rows) of the rows in use nearest to it; rows that are not in use have no part in any."""
+        return self._algebra.combinations(np.ascontiguousarray(G))  # type: ignore[no-any-return]
+
     def complement(self) -> FloatArray:
         """Orthonormal basis (nv, nv - rank) of L^T x over the null space x of the rows in use."""
         return self._algebra.complement().T  # type: ignore[no-any-return]
+
+    def smallest_of_all(self, G: FloatArray) -> float:
+        """The smallest singular value of all rows of G (rows, nv), however small; in one call."""
+        try:
+            return self._algebra.smallest(np.ascontiguousarray(G))  # type: ignore[no-any-return]
+        except ArithmeticError:
+            raise EvaluationError("the closures are not finite") from None
 
     def smallest(self, G: FloatArray, cut: float) -> tuple[int, float]:
         """Rank of G, with pivots below ``cut`` as zero, and its smallest singular value, 0 if rows
@@ -321,9 +350,15 @@ def row_algebra(pattern: BoolArray, model: pin.Model | None = None) -> RowAlgebr
     order = graph_order(pattern, parents)
     if core is None or nv <= KERNEL_ABOVE or not rows:
         return DenseAlgebra(order)
+    return _compiled(pattern, parents, order)
+
+
+def _compiled(pattern: BoolArray, parents: Sequence[int], order: Sequence[int]) -> CompiledAlgebra:
+    from srm_mbs._kernel import core
+
     supports = [np.flatnonzero(p).tolist() for p in pattern]
     return CompiledAlgebra(
-        core.Algebra(parents, supports, list(order), PIVOT_SHARE, PIVOT_WINDOW, "auto")
+        core.Algebra(list(parents), supports, list(order), PIVOT_SHARE, PIVOT_WINDOW, "auto")  # type: ignore[union-attr]
     )
 
 
@@ -403,6 +438,12 @@ def smallest_singular_value(A: FloatArray, zero: float) -> float:
     return float(size[size > zero].min(initial=np.inf))
 
 
+def active_rows(A: FloatArray) -> BoolArray:
+    """Which rows of A (m, n) are not zero (m,)."""
+    active: BoolArray = np.sqrt((A * A).sum(axis=1)) > INERT
+    return active
+
+
 class SingularValues:
     """Singular values of matrices whose entries lie in the same places; keeps what follows from
     them.  Threads may share it.
@@ -416,6 +457,32 @@ class SingularValues:
     def __init__(self, pattern: BoolArray) -> None:
         self._pattern = pattern
         self._algebras: dict[bytes, RowAlgebra] = {}
+        self._parts: dict[bytes, SingularValues] = {}
+
+    @cached_property
+    def supports(self) -> list[list[int]]:
+        """The columns of each row in which it may have entries, ascending."""
+        return [np.flatnonzero(row).tolist() for row in self._pattern]
+
+    def of_rows(self, active: BoolArray) -> SingularValues:
+        """Those of matrices that consist of the ``active`` rows (rows,)."""
+        key = active.tobytes()
+        if key not in self._parts:
+            self._parts[key] = SingularValues(self._pattern[active])
+        return self._parts[key]
+
+    def compiled(self, active: BoolArray) -> CompiledAlgebra | None:
+        """The kernel's algebra of the ``active`` rows (rows,); None for few columns, for which
+        LAPACK is as fast."""
+        if self._pattern.shape[1] <= COMPILED_ABOVE or not active.any():
+            return None
+        key = active.tobytes()
+        found = self._algebras.get(key)
+        if not isinstance(found, CompiledAlgebra):
+            pattern = self._pattern[active]
+            parents = [-1] * pattern.shape[1]
+            found = self._algebras[key] = _compiled(pattern, parents, graph_order(pattern, parents))
+        return found
 
     def __call__(self, matrices: FloatArray, k: int) -> FloatArray:
         """The k-th largest singular values (n,), k from 1, of ``matrices`` (n, rows, columns)."""
@@ -429,7 +496,7 @@ class SingularValues:
         rows depend on each other: the rows in use have other singular values."""
         if A.shape[1] <= SPARSE_ABOVE:
             return None
-        active = np.sqrt((A * A).sum(axis=1)) > INERT
+        active = active_rows(A)
         key = active.tobytes()
         if key not in self._algebras:
             self._algebras[key] = row_algebra(self._pattern[active])
@@ -438,6 +505,38 @@ class SingularValues:
             return None
         rank, value = algebra.smallest(A[active], zero)
         return (rank, value) if 0 < rank == np.count_nonzero(active) else None
+
+    def near_null_spaces(self, A: FloatArray, k: int) -> tuple[FloatArray, FloatArray]:
+        """Orthonormal bases (m, m - r) and (n, n - r) of the left and right singular vectors of A
+        (m, n) beyond the r singular values above ``VANISHING`` times the k-th largest, k from 1,
+        and above ``LEAST_VALUE``: those that vanish where A loses rank.
+
+        With many columns they follow from the factorisation, if its pivots have a clear gap there:
+        A = Q R Pi^T with the rows in use first, of which the others are the combinations
+        Pi R11^-1 R12, up to rows of the size of the pivots that are left.
+        """
+        if A.shape[1] > SPARSE_ABOVE:
+            found = self._factored_null_spaces(A, k)
+            if found is not None:
+                return found
+        left, size, right = np.linalg.svd(A)
+        rank = int(np.sum(size > max(VANISHING * size[k - 1], LEAST_VALUE)))
+        return left[:, rank:], right[rank:].T
+
+    def _factored_null_spaces(self, A: FloatArray, k: int) -> tuple[FloatArray, FloatArray] | None:
+        algebra = self.compiled(np.ones(len(A), dtype=bool))
+        if algebra is None or k > len(A):
+            return None
+        smallest = algebra.smallest_of_all(A) if k == len(A) else 0.0
+        cut = max(VANISHING * smallest, LEAST_VALUE)
+        algebra.factor(None, A, cut)
+        pivots, rank = algebra.pivots, algebra.rank
+        if not 0 < rank < len(pivots) or not pivots[rank - 1] > CLEAR_GAP * pivots[rank]:
+            return None
+        combinations = algebra.combinations(A)
+        others = np.diag(combinations) == 0.0
+        null = (np.eye(len(A)) - combinations)[others].T
+        return np.linalg.qr(null)[0], algebra.complement()
 
     def _of_one(self, A: FloatArray, k: int) -> float:
         found = self.smallest(A, PIVOT_ZERO)

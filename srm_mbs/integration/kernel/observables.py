@@ -10,7 +10,9 @@ import numpy as np
 from srm_mbs._kernel import core
 from srm_mbs._kernel.workspace import LARGE
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.rheonomic import all_rows
+from srm_mbs.dynamics.constraints.row_algebra import INERT, SingularValues, active_rows
 from srm_mbs.dynamics.forces import ForceKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
@@ -40,6 +42,8 @@ _all_rows_of_model = per_model(_make_all_rows)
 class CompiledObservables(Observables):
     """:class:`~srm_mbs.dynamics.observables.Observables`, evaluated by the kernel."""
 
+    _separated: tuple[ClosureGeometry, tuple[Any, Any, int] | None] | None = None
+
     @cached_property
     def _kernel(self) -> Any:
         mechanism = self.mechanism
@@ -64,6 +68,33 @@ class CompiledObservables(Observables):
         except ArithmeticError:
             return super().jacobians(t, q)
 
+    def smallest_values(
+        self,
+        geometry: ClosureGeometry,
+        values: SingularValues,
+        k: int,
+        t: FloatArray,
+        q: FloatArray,
+    ) -> FloatArray:
+        """As the reference, by one factorisation of the active rows for each state, from which
+        Lanczos' iteration follows the smallest singular value."""
+        if self._separated is None or self._separated[0] is not geometry:
+            self._separated = (
+                geometry,
+                _separated_rows(geometry, values, self.jacobians(t[:1], q[:1])),
+            )
+        prepared = self._separated[1]
+        # Of more active rows than k some depend on the others, and the last value is another.
+        if prepared is None or prepared[2] != k:
+            return super().smallest_values(geometry, values, k, t, q)
+        rows, algebra, _ = prepared
+        times, places = np.ascontiguousarray(t, dtype=float), np.ascontiguousarray(q)
+        found: FloatArray = self._kernel.smallest_values(rows, algebra, times, places)
+        others = np.isnan(found)  # other rows are active there
+        if others.any():
+            found[others] = super().smallest_values(geometry, values, k, t[others], q[others])
+        return found
+
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         return self._kernel.energies(np.hstack([q, v]))  # type: ignore[no-any-return]
 
@@ -87,6 +118,30 @@ class CompiledObservables(Observables):
                 return super()._powers(elements, t, q, v, resting)
             powers |= dict(zip(compiled, found.T))
         return {name: powers[name] for name in elements}
+
+
+def _separated_rows(
+    geometry: ClosureGeometry, values: SingularValues, jacobians: FloatArray
+) -> tuple[Any, Any, int] | None:
+    """Rows of ``geometry``, the algebra of those that are active at the first of the ``jacobians``
+    (n, rows, columns), as the kernel takes both, and the number of active rows; None for few
+    columns."""
+    active = active_rows(geometry.separated_rows(jacobians[:1])[0])
+    algebra = values.compiled(active)
+    if algebra is None:
+        return None
+    shares = geometry.shares
+    rows = core.SeparatedRows(  # type: ignore[union-attr]
+        supports=values.supports,
+        factors=geometry.row_factors,
+        share_rows=[row for row, _, _ in shares],
+        share_others=[other for _, other, _ in shares],
+        shares=np.array([share for *_, share in shares]),
+        left=geometry.left if shares else np.ones(len(active)),
+        active=np.flatnonzero(active).tolist(),
+        inert=INERT,
+    )
+    return rows, algebra.compiled, int(active.sum())
 
 
 def _states(t: FloatArray, q: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -13,6 +13,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs._kernel import workspace as workspaces
 from srm_mbs._kernel.workspace import workspace
+from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints import row_algebra as ranks
 from srm_mbs.dynamics.constraints import structure
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
@@ -26,6 +27,7 @@ from srm_mbs.dynamics.constraints.projection import (
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import (
     RowAlgebra,
+    SingularValues,
     coordinate_parents,
     row_algebra,
     trees,
@@ -368,3 +370,48 @@ def test_only_models_have_workspaces() -> None:
 def test_a_small_model_has_a_workspace_for_every_algorithm() -> None:
     model = load("four_bar").model
     assert workspace(model).Minv.shape == (3, 3)
+
+
+def near_null_projectors(A: FloatArray, k: int) -> tuple[FloatArray, FloatArray]:
+    """By all singular vectors."""
+    left, size, right = np.linalg.svd(A)
+    rank = int(np.sum(size > max(100.0 * size[k - 1], 1e-9)))
+    assert rank < k
+    return left[:, rank:] @ left[:, rank:].T, right[rank:].T @ right[rank:]
+
+
+@pytest.mark.parametrize("angle", [1e-12, 0.0])
+@pytest.mark.parametrize("loops", [6, 40])
+def test_near_null_spaces_are_those_of_the_singular_vectors(loops: int, angle: float) -> None:
+    """Singular values that vanish together, of loops that are singular at once."""
+    mechanism = srm.n_four_bar(loops)
+    cranks = np.isclose(mechanism.q0, np.pi / 2.0)
+    geometry = ClosureGeometry(mechanism, mechanism.q0)
+    A = geometry.normalised(np.where(cranks, angle, -angle))
+    A = A[np.linalg.norm(geometry.normalised(mechanism.q0 + 0.1), axis=1) > 1e-9]
+    left, right = SingularValues(np.ones_like(A, dtype=bool)).near_null_spaces(A, len(A))
+    both = near_null_projectors(A, len(A))
+    for basis, expected in zip((left, right), both):
+        np.testing.assert_allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-13)
+        np.testing.assert_allclose(basis @ basis.T, expected, rtol=0.0, atol=1e-10)
+
+
+def test_near_null_spaces_of_dependent_rows_and_repeated_values_are_those_of_the_vectors() -> None:
+    rng = np.random.default_rng(3)
+    left, right = (np.linalg.qr(rng.standard_normal((n, n)))[0] for n in (70, 90))
+    size = np.concatenate([np.full(30, 2.0), np.linspace(1.0, 0.3, 28), np.full(6, 1e-13)])
+    A = left[:, :64] * size @ right[:64]  # rank 58 of 64, and six more rows that depend on others
+    found = SingularValues(np.ones_like(A, dtype=bool)).near_null_spaces(A, 64)
+    for basis, expected in zip(found, near_null_projectors(A, 64)):
+        np.testing.assert_allclose(basis @ basis.T, expected, rtol=0.0, atol=1e-11)
+
+
+@with_kernel
+def test_null_spaces_without_a_clear_gap_are_those_of_the_singular_vectors() -> None:
+    rng = np.random.default_rng(4)
+    left, right = (np.linalg.qr(rng.standard_normal((n, n)))[0] for n in (70, 90))
+    A = left * np.geomspace(1.0, 1e-8, 70) @ right[:70]
+    values = SingularValues(np.ones_like(A, dtype=bool))
+    assert values._factored_null_spaces(A, 70) is None
+    for basis, expected in zip(values.near_null_spaces(A, 70), near_null_projectors(A, 70)):
+        np.testing.assert_allclose(basis @ basis.T, expected, rtol=0.0, atol=1e-11)

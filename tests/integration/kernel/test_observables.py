@@ -7,7 +7,8 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.constraints.geometry import geometry_of, separated_pattern
+from srm_mbs.dynamics.constraints import row_algebra
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, geometry_of, separated_pattern
 from srm_mbs.dynamics.constraints.row_algebra import SingularValues
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.observables import Observables
@@ -150,3 +151,75 @@ def test_singular_values_of_many_rows_are_those_of_lapack(loops: int, spread: fl
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-15)
     one_by_one = np.array([geometry.separated(place) for place in q])
     same(rows, one_by_one)
+
+
+def agrees_with_lapack(mechanism: srm.Mechanism, t: FloatArray, q: FloatArray) -> FloatArray:
+    """The values of the kernel, which are those of the plain computation to rounding."""
+    geometry, rank = geometry_of(mechanism, mechanism.q0), mechanism.structure.rank
+    values = SingularValues(separated_pattern(mechanism))
+    compiled, reference = both(mechanism)
+    found = compiled.smallest_values(geometry, values, rank, t, q)
+    rows = geometry.separated_rows(reference.jacobians(t, q))
+    expected = np.linalg.svd(rows, compute_uv=False)[:, rank - 1]
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=4e-15)
+    return found
+
+
+@pytest.mark.parametrize("name", srm.bundled_models())
+def test_smallest_singular_values_are_those_of_the_plain_computation(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Dependent rows (Bricard's mechanism), rows that are zero (planar loops), and drives."""
+    monkeypatch.setattr(row_algebra, "COMPILED_ABOVE", 0)
+    mechanism = load(name)
+    if mechanism.structure.rank:
+        t, q, _ = states(mechanism)
+        agrees_with_lapack(mechanism, t, np.vstack([mechanism.q0, q[1:]]))
+
+
+@pytest.mark.parametrize("loops", [6, 20, 40])
+@pytest.mark.parametrize("angle", [1e-3, 1e-7, 1e-12, 0.0])
+def test_smallest_singular_values_reach_zero_where_all_loops_are_singular_at_once(
+    loops: int, angle: float
+) -> None:
+    """With horizontal cranks rows vanish, and as many singular values as there are loops."""
+    mechanism = srm.n_four_bar(loops)
+    cranks = np.isclose(mechanism.q0, np.pi / 2.0)
+    q = np.where(cranks, angle, -angle)
+    found = agrees_with_lapack(mechanism, np.zeros(1), q[None])
+    assert found[0] <= angle + 1e-15
+
+
+def test_smallest_singular_values_of_nearly_parallel_rows_are_those_of_their_differences(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(row_algebra, "COMPILED_ABOVE", 0)
+    mechanism = floating_ring()
+    bare = geometry_of(mechanism, mechanism.q0)
+    t, q, _ = states(mechanism)
+    agrees_with_lapack(mechanism, t, q)
+    shared = ClosureGeometry(mechanism, mechanism.q0)
+    shared.__dict__["shares"] = [(1, 0, 0.75), (2, 1, -0.5)]
+    values = SingularValues(np.ones_like(separated_pattern(mechanism)))
+    compiled, reference = both(mechanism)
+    rows = shared.separated_rows(reference.jacobians(t, q))
+    k = int(np.linalg.matrix_rank(rows[0]))
+    found = compiled.smallest_values(shared, values, k, t, q)
+    expected = np.linalg.svd(rows, compute_uv=False)[:, k - 1]
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=4e-15)
+    others = compiled.smallest_values(bare, values, k, t, q)
+    assert np.abs(others - found).max() > 1e-3
+
+
+def test_rows_of_another_system_are_refused() -> None:
+    mechanism, other = srm.n_four_bar(8), srm.n_four_bar(9)
+    geometry = geometry_of(mechanism, mechanism.q0)
+    values = SingularValues(separated_pattern(mechanism))
+    compiled, _ = both(mechanism)
+    compiled.smallest_values(
+        geometry, values, mechanism.structure.rank, np.zeros(1), mechanism.q0[None]
+    )
+    rows, algebra, _ = compiled._separated[1]  # type: ignore[index]
+    kernel_system = both(other)[0]._kernel  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match="not those of the system"):
+        kernel_system.smallest_values(rows, algebra, np.zeros(1), other.q0[None])

@@ -29,8 +29,8 @@ def parser() -> argparse.ArgumentParser:
         add_help=False,
         description="Compare run time and error with other simulators, on one thread.",
         epilog="Everything takes about two hours. Peers that are not installed are skipped: "
-        "pip install mujoco exudyn scikit-sundae scipy-dae. Results that DIR already holds are "
-        "kept, but for what is measured again.",
+        "pip install mujoco exudyn scikit-sundae scipy-dae heyoka. Results that DIR already "
+        "holds are kept, but for what is measured again.",
     )
     out.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="Folder of the results."

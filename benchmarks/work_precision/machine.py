@@ -17,6 +17,7 @@ PACKAGES = (
     "exudyn",
     "scikit-sundae",
     "scipy-dae",
+    "heyoka",
 )
 
 

@@ -70,7 +70,7 @@ def _work_precision(
                 [point.error for point in points],
                 color=colour,
                 marker=marker,
-                linestyle=(line, "--", ":")[k] if peer == records.OURS else line,
+                linestyle=(line, "--", ":", "-.")[k] if peer == records.OURS else line,
                 linewidth=width,
                 markersize=4.5,
                 markerfacecolor=colour if k == 0 else "white",

@@ -15,9 +15,10 @@ from pathlib import Path
 
 from benchmarks.work_precision import plots, records
 from benchmarks.work_precision.counting import LEVELS
-from benchmarks.work_precision.records import FLOOR, OURS, Results
+from benchmarks.work_precision.records import FLOOR, OURS, TAYLOR, Results
 from benchmarks.work_precision.tables import (
     DEFAULT_VARIANTS,
+    GENERATED_VARIANTS,
     Best,
     best,
     markdown,
@@ -51,7 +52,8 @@ def _measured(results: Results, problems: Sequence[str]) -> list[str]:
 
 
 def table(results: Results, problems: Sequence[str] | None = None) -> str:
-    """Our default, the best simulator and the reduced equation at every level, in CPU ms.
+    """Our default and generated code, the best simulator and equations written by hand at every
+    level, in CPU ms; what heyoka's first run took longer than the others, for its compilation.
 
     Parameters
     ----------
@@ -62,27 +64,43 @@ def table(results: Results, problems: Sequence[str] | None = None) -> str:
     for problem in problems or list(results.problems):
         facts = results.problems[problem]
         ours = [best(results, problem, [OURS], level, DEFAULT_VARIANTS) for level in LEVELS]
+        generated = [best(results, problem, [OURS], level, GENERATED_VARIANTS) for level in LEVELS]
         peers = [best(results, problem, simulators(results), level) for level in LEVELS]
         floor = [best(results, problem, [FLOOR], level) for level in LEVELS]
+        taylor = [best(results, problem, [TAYLOR], level) for level in LEVELS]
+        compilation = next(
+            (
+                row.first_call
+                for row in results.preparations
+                if (row.problem, row.peer) == (problem, TAYLOR)
+            ),
+            None,
+        )
         names = dict.fromkeys(results.peers[entry.peer] for entry in peers if entry)
         rows.append(
             (
                 facts["title"],
                 _triple(ours),
+                _triple(generated) if any(generated) else "",
                 _triple(peers),
                 "; ".join(names) or "none",
                 " / ".join(_ratio(peer, own) for peer, own in zip(peers, ours)),
                 _triple(floor) if any(floor) else "",
+                _triple(taylor) if any(taylor) else "",
+                f"{compilation:.2g}" if compilation else "",
             )
         )
     levels = " / ".join(f"{level:.0e}" for level in LEVELS)
     header = (
         f"CPU ms at error {levels}",
         "srm_mbs",
+        "srm_mbs, generated code",
         "best other simulator",
         "which",
         "ratio",
-        "hand-reduced ODE",
+        "equations by hand, SciPy",
+        "equations by hand, heyoka",
+        "heyoka compiles, s",
     )
     return markdown(header, rows)
 
@@ -115,7 +133,7 @@ def summary(results: Results, figure: str) -> str:
 def block(results: Results, figure: str) -> str:
     """Text between the marks of docs/benchmarks.md; ``figure`` as in :func:`summary`."""
     versions = results.versions
-    names = ("pin", "mujoco", "exudyn", "scikit-sundae", "scipy-dae", "scipy")
+    names = ("pin", "mujoco", "exudyn", "scikit-sundae", "scipy-dae", "scipy", "heyoka")
     option = _until(results, " --limit {limit}")
     until = _until(results, " with runs of up to {limit} s")
     listed = ", ".join(f"{name} {versions[name]}" for name in names if versions.get(name))
@@ -130,7 +148,9 @@ def block(results: Results, figure: str) -> str:
             f"{listed}). A run includes integration and output at 100 times; its error is the "
             "largest over these times. A setting counts for an error only if it and every tighter "
             "setting reach it. The column srm_mbs has the default settings, the others the best of "
-            f"their variants (Baumgarte rates, softness). A dash: not reached{until}.",
+            f"their variants (Baumgarte rates, softness). A dash: not reached{until}.  Generated "
+            "code is compiled before; heyoka compiles in its first run, here at the loosest "
+            "tolerance.",
         ]
     )
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 SCHEMA = 1
-OURS, FLOOR = "ours", "reduced"
+OURS, FLOOR, TAYLOR = "ours", "reduced", "taylor"
 """Names of the two peers that are not counted among the other simulators."""
 DIGITS = 5
 """Significant digits of the numbers in the file."""

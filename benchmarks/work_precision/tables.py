@@ -10,11 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.work_precision.counting import LEVELS, Point, cheapest
-from benchmarks.work_precision.records import FLOOR, OURS, Results
+from benchmarks.work_precision.records import FLOOR, OURS, TAYLOR, Results
 
 DEFAULT_VARIANTS = ("dop853, auto", "auto, auto")
 """What somebody gets who sets nothing but the tolerance: the first, or the second where the problem
 is stiff."""
+
+GENERATED_VARIANTS = ("dop853, generated", "auto, generated")
+"""The same with code that is compiled for the mechanism."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,8 @@ def best(
 
 
 def simulators(results: Results) -> list[str]:
-    """The measured peers without us and without the floor."""
-    return [peer for peer in results.peers if peer not in (OURS, FLOOR)]
+    """The measured peers without us and without those that integrate equations written by hand."""
+    return [peer for peer in results.peers if peer not in (OURS, FLOOR, TAYLOR)]
 
 
 def ratio_rows(results: Results, level: float) -> list[dict[str, Any]]:

@@ -300,6 +300,23 @@ def test_peers_with_fixed_steps_simulate_planar_loops(peer: str, name: str) -> N
     assert difference.max() < 1e-3
 
 
+@pytest.mark.parametrize(
+    "name", ["slider_crank_whirl", "slider_crank_regular", "n_four_bar_2", "squeezing_mechanism"]
+)
+def test_heyoka_integrates_the_equations_written_by_hand(name: str) -> None:
+    chosen = installed("taylor")
+    problem = shared(name)
+    observed = simulated(problem, chosen, Setting("rtol", 1e-12))
+    assert problem.error(observed) < 1e-9
+
+
+def test_elimination_of_expressions_solves_what_the_matrix_of_numbers_does() -> None:
+    y = shared("squeezing_mechanism").reference.observed[20]
+    in_numbers = andrews.field(0.0, y)
+    in_objects = andrews.field(0.0, y.astype(object)).astype(float)
+    np.testing.assert_allclose(in_objects, in_numbers, rtol=1e-9)
+
+
 def test_references_agree_with_independent_integrators() -> None:
     field = lambda t, y: np.array([y[1], -np.sin(y[0])])  # noqa: E731
     times = np.linspace(0.0, 5.0, 6)[1:]

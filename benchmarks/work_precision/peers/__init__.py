@@ -21,6 +21,7 @@ from benchmarks.work_precision.peers.reduced_implicit import (
     ReducedRadau,
 )
 from benchmarks.work_precision.peers.reduced_ode import ReducedODE
+from benchmarks.work_precision.peers.reduced_taylor import ReducedTaylor
 from benchmarks.work_precision.peers.scipy_dae_radau import ScipyDaeRadau
 from benchmarks.work_precision.peers.sundials_ida import SundialsIDA
 
@@ -30,6 +31,7 @@ PEERS: Mapping[str, Peer] = MappingProxyType(
         for peer in (
             Ours(),
             ReducedODE(),
+            ReducedTaylor(),
             PinocchioDOP853(),
             PinocchioDOP853Baumgarte(),
             PinocchioRK4Baumgarte(),

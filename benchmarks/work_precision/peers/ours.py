@@ -17,6 +17,7 @@ from benchmarks.work_precision.peers.base import (
     Setting,
 )
 from benchmarks.work_precision.problems.base import Problem
+from srm_mbs.integration.generated.code_cache import compiler
 
 TOLERANCES = tuple(10.0**-k for k in range(2, 13))
 """From the loosest that ``simulate`` takes."""
@@ -38,12 +39,15 @@ class Ours(Peer):
         """For all problems."""
 
     def variants(self, stiff: bool = False) -> list[str]:
-        """``tableau, backend``; the Python backend apart where there is another.  The default
-        tableau has its own name where the problem is stiff; elsewhere it is dop853."""
-        if stiff:
-            return ["auto, auto", "rodas5p, auto"]
-        out = ["dop853, auto", "dopr54, auto"]
-        return [*out, "dop853, python"] if srm.backend() == "kernel" else out
+        """``tableau, backend``; generated code, where there is a C compiler, and the Python backend
+        apart from the kernel.  The default tableau has its own name where the problem is stiff;
+        elsewhere it is dop853."""
+        usual, other = ("auto", "rodas5p") if stiff else ("dop853", "dopr54")
+        out = [f"{usual}, auto", f"{other}, auto"]
+        if srm.backend() == "kernel":
+            out += [f"{usual}, generated"] if compiler() is not None else []
+            out += [] if stiff else [f"{usual}, python"]
+        return out
 
     def settings(self, problem: Problem) -> Sequence[Setting]:
         return [
@@ -65,9 +69,16 @@ class Ours(Peer):
             tableau, backend = setting.variant.split(", ")
 
             def run() -> Outcome:
-                solution = srm.simulate(
-                    mechanism, problem.t_end, rtol=setting.value, tableau=tableau, backend=backend
-                )
+                try:
+                    solution = srm.simulate(
+                        mechanism,
+                        problem.t_end,
+                        rtol=setting.value,
+                        tableau=tableau,
+                        backend=backend,
+                    )
+                except srm.InputError as error:  # of mechanisms without generated code
+                    raise RunFailedError(str(error)) from error
                 if not solution.success:
                     raise RunFailedError(solution.message)
                 q, v = solution(times)

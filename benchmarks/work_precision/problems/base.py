@@ -48,6 +48,8 @@ class Problem:
     reduced
         The model in minimal coordinates, if there is one, whose state ``expand`` turns into
         columns.
+    index_one
+        Equations of index 1 written by hand, whose states are the columns of the observation.
     stiff
         Whether forces are stiff: we take the tableaus for that, and the peers are implicit
         integrators of the reduced model.
@@ -71,6 +73,7 @@ class Problem:
     rate_unit: float = 1.0
     reduced: ReducedModel | None = None
     expand: Callable[[Array], Array] = lambda observed: observed
+    index_one: ReducedModel | None = None
     singular: bool = False
     stiff: bool = False
     planar: tuple[int, int] | None = None

@@ -121,12 +121,12 @@ def parameter_values(given: Sequence[str]) -> dict[str, float]:
         except ValueError as error:
             raise InputError(
                 f"{text!r} is not a name and a number",
-                element="set",
+                element="parameters",
                 remedy="Give it as crank=0.3",
             ) from error
         if name in values:
             raise InputError(
-                f"the parameter {name!r} is given twice", element="set", remedy="Keep one"
+                f"the parameter {name!r} is given twice", element="parameters", remedy="Keep one"
             )
         values[name] = number
     return values

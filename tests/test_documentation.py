@@ -99,8 +99,8 @@ def fragments() -> list[tuple[str, str]]:
 def test_the_tables_of_descriptions_on_a_page_are_valid(page: str, text: str) -> None:
     entries = parse_toml('format = 1\nurdf = "x.urdf"\n' + text, page)
     description = check_description(resolved(entries, {}, page)[0], page)
-    found = len(description.loop) + len(description.drive) + len(description.force)
-    assert found == text.count("[[")
+    kinds = (description.loop, description.drive, description.force, description.override)
+    assert sum(map(len, kinds)) == text.count("[[")
 
 
 @pytest.mark.parametrize("page", PAGES)

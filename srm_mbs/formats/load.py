@@ -23,6 +23,7 @@ from srm_mbs.formats.registry import DESCRIPTION, LINKAGE, Format, find_format, 
 from srm_mbs.formats.toml.description import Description, check_description
 from srm_mbs.formats.toml.parameters import given_parameters, resolved
 from srm_mbs.formats.translation import Options, merged
+from srm_mbs.formats.urdf.override import override, without_overrides
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
 from srm_mbs.model.mechanism import Source, variant_maker
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array, name_list
@@ -122,6 +123,17 @@ def _translated(
     options = Options(cut, entries, reach, keyframe, base, description.planar)
     translation = found.translate(model, options)
     given, as_read = overrides.entries(), bool(own.text)
+    if description.override:
+        if found is LINKAGE:
+            raise InputError(
+                "a planar linkage has no joints and links to change",
+                file=own.file,
+                element="override",
+                remedy='Give its points and masses expressions, as "=2*crank"',
+            )
+        override(translation.tree, description.override, own.file, model.file)
+        translation = replace(translation, write=None)  # the text of the changed tree
+        entries, as_read = without_overrides(entries), False
     if translation.entries or found.key != "urdf":
         urdf_name = Path(model.file).with_suffix(".urdf").name
         entries = merged(entries, translation.entries, urdf_name)

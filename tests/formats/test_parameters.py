@@ -17,6 +17,7 @@ import srm_mbs as srm
 from srm_mbs.cli.model_file import parameter_values
 from srm_mbs.formats.toml.parameters import resolved
 from tests.support.bundled import load
+from tests.support.commands import error_line, row, run
 from tests.support.snapshots import check_refusals
 
 LINKAGE = """format = 1
@@ -137,6 +138,50 @@ def test_runs_and_conversions_keep_the_numbers(linkage: Path, tmp_path: Path) ->
 
 def test_values_on_the_command_line_are_names_and_numbers() -> None:
     assert parameter_values(["crank=0.3", "rod=1e-2"]) == {"crank": 0.3, "rod": 0.01}
+
+
+def test_commands_take_values_of_parameters(linkage: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run.npz"
+    values = ("--set", "crank=0.31", "--set", "rocker=0.8")
+    run("simulate", linkage, *values, "--t-end", 0.1, "--out", out)
+    wanted = srm.load(linkage, parameters={"crank": 0.31, "rocker": 0.8})
+    assert srm.load_solution(out).mechanism.parameters == wanted.parameters
+    assert np.array_equal(srm.load_solution(out).q[0], wanted.q0)
+    plain, changed = (run("info", linkage, *given) for given in ((), values))
+    assert row(plain, "degrees of freedom") == row(changed, "degrees of freedom")
+    assert plain != changed
+
+
+@pytest.mark.parametrize(
+    ("given", "start"),
+    [
+        ("cranc=1", "{file}: --set: there is no parameter 'cranc'"),
+        ("crank=nan", "--set: the parameter 'crank' = nan is not a finite number"),
+        ("crank", "--set: 'crank' is not a name and a number"),
+        ("idle=2", "{file}: --set: nothing in the description uses the parameter 'idle'"),
+    ],
+)
+def test_faults_of_the_command_line_name_its_option(linkage: Path, given: str, start: str) -> None:
+    text = LINKAGE.replace("[parameters]", "[parameters]\nidle = 1.0")
+    linkage.write_text(text, encoding="utf-8")
+    line = error_line(run("info", linkage, "--set", given, status=2))
+    assert line.startswith(f"error: {start.format(file=linkage)}")
+
+
+@pytest.mark.parametrize(
+    ("table", "start"),
+    [
+        ("sin = 1.0", "[parameters]: 'sin' cannot be the name of a parameter"),
+        ("crank = true", "parameters.crank: a finite number is wanted"),
+    ],
+)
+def test_faults_of_the_table_of_a_file_do_not_name_the_option(
+    linkage: Path, table: str, start: str
+) -> None:
+    linkage.write_text(LINKAGE.replace("crank = 0.3\n", f"{table}\n"), encoding="utf-8")
+    for more in ((), ("--set", "rocker=0.5")):
+        line = error_line(run("info", linkage, *more, status=2))
+        assert line.startswith(f"error: {linkage}: {start}")
 
 
 def test_messages_about_parameters(linkage: Path) -> None:

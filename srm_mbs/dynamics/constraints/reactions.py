@@ -26,7 +26,8 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
-from srm_mbs._typing import FloatArray
+from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.dynamics.constraints.compiled_rows import ClosureRows
 from srm_mbs.dynamics.constraints.projection import cholesky, whiten
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, driven_closures
 from srm_mbs.dynamics.constraints.wrenches import (
@@ -39,6 +40,7 @@ from srm_mbs.dynamics.constraints.wrenches import (
     sums_of_subtrees,
 )
 from srm_mbs.dynamics.forces import resolved_forces
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import KnownKeys
 from srm_mbs.model.drives import in_order_of_rows
@@ -149,22 +151,38 @@ def _multipliers(
 ) -> Iterator[tuple[int, FloatArray | None, FloatArray]]:
     """Number of the state, lam (rows,) of all rows, unscaled, None for a mechanism without
     effective closures, and the acceleration v' (nv,)."""
-    mechanism = system.mechanism
+    mechanism, n = system.mechanism, len(t)
     model = mechanism.model
-    rows = DrivenKinematics(model, mechanism.loops, mechanism.drives)
-    scale = mechanism.structure.row_scale
-    data = workspace(model)
-    for i in range(len(t)):
+    accelerations, ranks = np.empty((n, model.nv)), np.zeros(n, dtype=int)
+    multipliers = np.empty((n, model.nv))
+    closed = system.has_constraints
+    for i in range(n):
         terms = system.evaluate(t[i], np.concatenate([q[i], v[i]]))
-        acceleration = terms.rate()[model.nv :].copy()
-        if not system.has_constraints:
-            yield i, None, acceleration
-            continue
-        yhat = terms.multiplier().copy()
-        rows.evaluate(model, data, q[i])
-        U = cholesky(data.M)
-        W = whiten(U, (rows.G / scale[:, None]).T)
-        left, singular, right = np.linalg.svd(W, full_matrices=False)
-        k = terms.rank
-        lam = ((left[:, :k].T @ (U @ yhat)) / singular[:k]) @ right[:k] / scale
-        yield i, lam, acceleration
+        accelerations[i] = terms.rate()[model.nv :]
+        if closed:
+            multipliers[i], ranks[i] = terms.multiplier(), terms.rank
+    found = _unscaled(mechanism, q, multipliers, ranks) if closed else [None] * n
+    yield from zip(range(n), found, accelerations)
+
+
+def _unscaled(
+    mechanism: Mechanism, q: FloatArray, multipliers: FloatArray, ranks: IndexArray
+) -> FloatArray:
+    """lam (n, rows), of least norm, with E^T lam the ``multipliers`` (n, nv) of rows of these
+    ``ranks`` (n,)."""
+    model, scale = mechanism.model, mechanism.structure.row_scale
+    rows = ClosureRows(model, DrivenKinematics(model, mechanism.loops, mechanism.drives))
+    data = workspace(model)
+    U = np.empty((len(q), model.nv, model.nv))
+    W = np.empty((len(q), model.nv, len(scale)))
+    for i in range(len(q)):
+        rows.evaluate(q[i])
+        U[i] = cholesky(pin.crba(model, data, q[i]))
+        W[i] = whiten(U[i], (rows.G / scale[:, None]).T)
+    left, singular, right = np.linalg.svd(W, full_matrices=False)
+    white = np.einsum("nij,nj->ni", np.triu(U), multipliers)
+    parts = np.einsum("nik,ni->nk", left, white)
+    used = np.arange(singular.shape[1]) < ranks[:, None]
+    shares = np.divide(parts, singular, out=np.zeros_like(parts), where=used)
+    lam: FloatArray = np.einsum("nk,nkr->nr", shares, right) / scale
+    return lam

@@ -25,7 +25,9 @@ MOST_PARAMETERS = 1000
 DEEPEST_CHAIN = 50
 """Parameters of which each is an expression over the next."""
 PARAMETERS = "parameters"
-"""Key of the table of parameters."""
+"""Key of the table of parameters, and the element of faults of values that are given instead."""
+TABLE = "[parameters]"
+"""The element of faults of the table."""
 
 BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
@@ -97,7 +99,7 @@ def resolved(
             raise InputError(
                 f"nothing in the description uses the parameter {name!r}",
                 file=file,
-                element=f"{PARAMETERS}.{name}",
+                element=PARAMETERS,
                 remedy=f'Use it in an expression, as "={name}", or leave its value out',
             )
     if not known.changed and PARAMETERS not in entries:
@@ -114,20 +116,20 @@ class _Parameters:
         if not isinstance(table, dict):
             raise InputError(
                 f"a table is wanted, not {shortened(safe_repr(table))}",
-                element=PARAMETERS,
+                element=TABLE,
                 remedy="Write [parameters] above lines of the form crank = 0.268",
             )
         if len(table) > MOST_PARAMETERS:
             raise InputError(
                 f"there are more than {MOST_PARAMETERS} parameters",
-                element=PARAMETERS,
+                element=TABLE,
                 remedy="Remove some",
             )
         for name in table:
             if not name.isidentifier() or keyword.iskeyword(name) or name in _RESERVED:
                 raise InputError(
                     f"{name!r} cannot be the name of a parameter",
-                    element=PARAMETERS,
+                    element=TABLE,
                     remedy="Give a name of letters, digits and _, other than that of a function "
                     "or constant",
                 )

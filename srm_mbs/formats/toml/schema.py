@@ -19,7 +19,6 @@ import pydantic
 from pydantic import BaseModel, ConfigDict, PlainValidator, StrictBool, StrictStr, create_model
 from pydantic_core import PydanticCustomError
 
-from srm_mbs.model.actuators import Actuator
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive
@@ -173,7 +172,6 @@ DriveEntry: Any = _entry(
     "One ``[[drive]]``: the motion that is prescribed, and the keys of its law.",
     {**_LAW, **_NAME, **_keys(Drive, ("law", "name"))},
 )
-ActuatorEntry: Any = _entry("ActuatorEntry", "One of ``[actuators]``.", _keys(Actuator))
 CSV_KEYS = {"torque": TABLE_KEYS, "wrench": TABLE_KEYS[:2]}
 """Keys by which forces take their values over time from a CSV file."""
 
@@ -293,6 +291,23 @@ class PlanarEntry(StrictEntry):
     drive: list[PlanarDrive] = []
 
 
+class OverrideEntry(StrictEntry):
+    """One ``[[override]]``: changes of a joint or a link of the file (docs/formats.md).
+
+    ``scale`` multiplies the place of the joint in its parent, or mass and moments of inertia of the
+    link, these ``inertia_scale`` as well; ``xyz`` (m) is added to the place of the joint or of the
+    centre of mass, ``mass`` (kg) and ``inertia`` (kg m^2; xx, xy, xz, yy, yz, zz) to the link's.
+    """
+
+    joint: StrictStr | None = None
+    link: StrictStr | None = None
+    scale: Positive = 1.0
+    inertia_scale: Positive = 1.0
+    xyz: Vector = [0.0, 0.0, 0.0]
+    mass: Number = 0.0
+    inertia: Annotated[list[Number], pydantic.Field(min_length=6, max_length=6)] = [0.0] * 6
+
+
 class InitialEntry(StrictEntry):
     """``[initial]``: held positions and rates, and guesses, by joint name."""
 
@@ -332,6 +347,6 @@ class TopEntry(StrictEntry):
     force: list[AnyForceEntry] = []
     drive: list[DriveEntry] = []
     points: dict[StrictStr, AnchorEntry] = {}
-    actuators: dict[StrictStr, ActuatorEntry] = {}
+    override: list[OverrideEntry] = []
     initial: InitialEntry = InitialEntry()
     simulation: SimulationEntry = SimulationEntry()

@@ -12,6 +12,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.integration.generated.algebra import algebra_of
 from srm_mbs.integration.generated.code import load_code
 from srm_mbs.integration.generated.structure import UnsupportedElementError, structure_of
 from srm_mbs.integration.kernel import backend
@@ -173,6 +174,14 @@ def _agree(mechanism: srm.Mechanism, count: int = 8) -> None:
             size = np.abs(a[key]).max()
             if np.isfinite(size):
                 assert np.abs(a[key] - b[key]).max() <= max(allowed, 1e-12) * max(size, 1e-3), key
+
+
+@pytest.mark.parametrize("loops", [19, 30])
+def test_evaluations_of_many_loops_are_those_of_the_kernel(loops: int) -> None:
+    """With generated algebra, and beyond its sizes with the kernel's."""
+    mechanism = srm.n_four_bar(loops)
+    assert (algebra_of(mechanism.model.nv, 2 * loops, 2 * loops) != "") == (loops == 19)
+    _agree(mechanism, count=2)
 
 
 @pytest.mark.parametrize("name", srm.bundled_models())

@@ -353,8 +353,8 @@ def info(file: ModelFile) -> None:
     """Describe a mechanism: joints, loops, forces, the start.
 
     With its size and mass, its degrees of freedom, the rank of its closure rows, the rows that are
-    redundant, what is stiff, and its drives and actuators.  Of a saved run (.npz) first a summary, with the residuals of the
-    singular configurations it met.
+    redundant, what is stiff, and its drives and actuators.  Of a saved run (.npz) first a summary,
+    with the residuals of the singular configurations it met.
     """
     from srm_mbs._kernel import missing, remedy
     from srm_mbs.analysis.summary import (

@@ -48,6 +48,7 @@ OPAQUE = re.compile(r"<!--|<!\[CDATA\[|<\?")
 """Beginnings of parts in which no tag is read."""
 ENDS = {"<!--": "-->", "<![CDATA[": "]]>", "<?": "?>"}
 """Of each such part, where it ends."""
+NULL_END = "null characters at the end of the file are left out, as tinyxml reads it"
 DASHES = "comments with -- inside, which XML does not allow, are skipped as tinyxml skips them"
 LATE_DECLARATION = (
     "an XML declaration that is not at the start, which XML does not allow, is skipped"
@@ -336,6 +337,7 @@ def parse_xml(text: str, file: str, notes: list[str] | None = None) -> Element:
         for mended, note in (
             (_without_late_declaration(text), LATE_DECLARATION),
             (_without_dashes(text), DASHES),
+            (text.rstrip("\0"), NULL_END),
         ):
             if mended != text:
                 root = parse_xml(mended, file, notes)

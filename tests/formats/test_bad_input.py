@@ -458,7 +458,7 @@ URDF_FAULTS = {
     "two masses": ('<mass value="1"/>', '<mass value="1"/><mass value="2"/>'),
     "two inertials": ("<inertial>", INERTIAL + "<inertial>"),
     "two axes": (AXIS, '<axis xyz="1 0 0"/>' + AXIS),
-    "two children": ('<child link="crank"/>', '<child link="crank"/>' * 2),
+    "two children": ('<child link="crank"/>', '<child link="crank"/><child link="rod"/>'),
     # numbers
     "nan mass": ('mass value="1"', 'mass value="nan"'),
     "infinite mass": ('mass value="1"', 'mass value="inf"'),

@@ -291,6 +291,9 @@ def test_friction_goes_to_the_joint_that_has_it(locked: str, tmp_path: Path) -> 
             '<limit command_effort="40" current="10" gear_velocity="10" '
             'lower="-1.7976931348623157e308"',
         ),
+        ('<limit lower="-9"', '<limit twist="0.3" lower="-9"'),
+        ('<link name="base"/>', '<link name="base" concave="yes"/>'),
+        ('<dynamics damping="0.7"/>', '<dynamics damping="0.7"/><dynamics damping="0.7"/>'),
         ('type="fixed">', 'type="fixed"><axis xyz="0 0 0"/><limit/><mimic joint="axle"/>'),
         ('type="continuous">', 'type="continuous"><limit velocity="3"/>'),
         ('<robot name="zoo">', '<?xml version="1.0"?><robot name="zoo" version="1.0">'),

@@ -9,7 +9,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.formats import xml
-from srm_mbs.formats.xml import DASHES, LATE_DECLARATION, parse_xml
+from srm_mbs.formats.xml import DASHES, LATE_DECLARATION, NULL_END, parse_xml
 from tests.support import sdf_files
 from tests.support.urdf_files import tree
 
@@ -90,6 +90,19 @@ def test_a_declaration_after_blank_lines_or_comments_is_skipped(before: str) -> 
     assert [node.tag for node in root] == ["b"]
     assert LATE_DECLARATION in notes
     assert (DASHES in notes) == ("--" in before[4:-4])
+
+
+def test_null_characters_at_the_end_are_left_out() -> None:
+    notes: list[str] = []
+    root = parse_xml("<a><b/></a>\n\0\0", "x.urdf", notes)
+    assert [node.tag for node in root] == ["b"]
+    assert notes == [NULL_END]
+
+
+@pytest.mark.parametrize("text", ["<a>\0<b/></a>", "<a><b/></a>\0<c/>"])
+def test_null_characters_elsewhere_are_refused(text: str) -> None:
+    with pytest.raises(srm.InputError, match="not well-formed"):
+        parse_xml(text, "x.urdf")
 
 
 def test_a_second_declaration_is_refused() -> None:

@@ -128,6 +128,8 @@ class SdfReader:
         models, own and merged ones first."""
         canonical, merged = [], [part for part in node.findall("include") if self._merges(part)]
         for part in node:
+            if part.tag == "link" and self._is_ground(part, scope):
+                continue
             if part.tag == "link":
                 canonical.append(self.link(part, scope))
             elif part in merged:
@@ -144,6 +146,17 @@ class SdfReader:
         for joint in node.findall("joint"):
             self.joint_frame(joint, scope)
         return canonical
+
+    def _is_ground(self, node: Element, scope: Scope) -> bool:
+        """Whether a link stands for the ground: it has its name, and no inertia.
+
+        For Gazebo the joints of such a link are on the ground, and for Bullet the link is static.
+        """
+        if (node.get("name") or "").strip() != WORLD or node.find("inertial") is not None:
+            return False
+        model = scope.prefix.removesuffix(SEPARATOR) or "the file"
+        self.values.remark("a link called 'world' without <inertial> is the ground", model)
+        return True
 
     def link(self, node: Element, scope: Scope) -> str:
         name = self.name(node, scope)

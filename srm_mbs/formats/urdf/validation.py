@@ -58,7 +58,8 @@ ATTRIBUTES = {
 }
 INFORMATIVE = {
     "joint": ("independent",),
-    "limit": words("command_effort current gear_velocity acceleration deceleration jerk"),
+    "link": ("concave",),
+    "limit": words("twist command_effort current gear_velocity acceleration deceleration jerk"),
     "dynamics": ("D", "K", "mu_coulomb", "mu_viscous", "coulomb_window"),
 }
 """Attributes of other tools found in published files, with or without a prefix: ignored, with a
@@ -152,8 +153,15 @@ class ElementChecker(XmlFile):
                 problem = f"unknown element <{tag}> in <{node.tag}>"
                 raise self.unknown(where or f"<{tag}>", problem, (*read, *ignored))
         for tag in read:
-            if tag not in MANY and len(node.findall(tag)) > 1:
+            found = node.findall(tag)
+            if tag in MANY or len(found) < 2:
+                continue
+            first, *others = found
+            if len(first) or any(other.attrib != first.attrib or len(other) for other in others):
                 raise self.fault(where, f"<{tag}> is given twice", "Keep one")
+            for other in others:
+                node.remove(other)
+            self.ignore(f"repeated <{tag}> element")
 
     def nothing_acts_in(self, node: Element, where: str) -> None:
         """Refuse loops and couplings in an element that is ignored as a whole, and inertia in one

@@ -767,3 +767,13 @@ def test_every_cassie_file_is_posed_and_weighs_what_it_says(name: str) -> None:
                 for anchor in (entry["a"], entry["b"])
             )
             same(a, b)
+
+
+def test_a_link_called_world_without_inertia_is_the_ground(tmp_path: Path) -> None:
+    path = tmp_path / "robot.sdf"
+    path.write_text(four_bar())
+    plain = srm.load(path)
+    path.write_text(four_bar('<link name="world"><pose>0 0 3 0 0 0</pose></link>'))
+    grounded = srm.load(path)
+    assert grounded.model == plain.model
+    assert "a link called 'world' without <inertial> is the ground: the file" in grounded.notes

@@ -28,6 +28,7 @@ from tools import closure_sketches, plot_pictures, singular_pictures, tutorials
 from tools.method_tables import filled
 from tools.pages import DOCS, PRINTS, ROOT, blocks, is_whole, run_page, with_printed
 from tools.singular_pictures import by_scipy
+from tools.site import add_animations
 
 SOURCE = ROOT / "srm_mbs"
 PAGES = {
@@ -243,6 +244,13 @@ def test_the_film_of_a_tutorial_moves_and_is_small(page: str) -> None:
         frames = [np.asarray(frame.convert("L"), float) for frame in ImageSequence.Iterator(film)]
     assert len(frames) > 20
     assert all(np.abs(b - a).max() > 50.0 for a, b in pairwise(frames))
+
+
+def test_the_site_has_the_animations_that_its_frames_show(tmp_path: Path) -> None:
+    (tmp_path / "tutorials").mkdir()
+    written = add_animations(tmp_path)
+    assert sorted(path.stem for path in written) == sorted(tutorials.PICTURES)
+    assert all(path.stat().st_size > 500_000 for path in written)
 
 
 def test_the_work_of_the_motor_in_the_press_is_that_on_the_workpiece(ran: Ran) -> None:

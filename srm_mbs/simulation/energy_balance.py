@@ -108,10 +108,6 @@ class BalancedRun(Protocol):
         """The balance at ``t``."""
 
     @property
-    def drive_forces(self) -> Mapping[str, FloatArray]:
-        """Force of each drive (n,), N or N m."""
-
-    @property
     def drive_rates(self) -> Mapping[str, FloatArray]:
         """Prescribed rate of each drive (n,), m/s or rad/s."""
 
@@ -146,8 +142,8 @@ def _elements(run: BalancedRun, system: _System) -> Powers:
 def _drives(run: BalancedRun, system: _System) -> Powers:
     if not run.mechanism.drives:
         return {}
-    rates = run.drive_rates
-    return {f"drive {name}": force * rates[name] for name, force in run.drive_forces.items()}
+    rates, forces = run.drive_rates, run.observables.drive_forces(run.t, run.q, run.v)
+    return {f"drive {name}": force * rates[name] for name, force in forces.items()}
 
 
 TERMS: tuple[Callable[[BalancedRun, _System], Powers], ...] = (

@@ -15,6 +15,7 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.reactions import reactions_at
 from srm_mbs.dynamics.constraints.rheonomic import all_rows, constraint_errors
 from srm_mbs.dynamics.constraints.row_algebra import SingularValues
 from srm_mbs.dynamics.forces import ForceKinematics
@@ -108,6 +109,17 @@ class Observables:
             kinetic = system.kinetic_energy(*state)
             out[i] = kinetic, system.energy(np.concatenate(state)) - kinetic
         return out
+
+    def drive_forces(self, t: FloatArray, q: FloatArray, v: FloatArray) -> dict[str, FloatArray]:
+        """Force (n,) N or torque N m of each drive on its coordinate
+        (:class:`~srm_mbs.dynamics.constraints.reactions.Reactions`).
+
+        Raises
+        ------
+        EvaluationError, ControllerError
+            If the equations of motion cannot be evaluated.
+        """
+        return reactions_at(self.system, t, q, v).drives
 
     def powers(self, t: FloatArray, q: FloatArray, v: FloatArray) -> dict[str, FloatArray]:
         """Power (n,) W of each force element but that of its potential, by name.

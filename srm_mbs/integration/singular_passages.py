@@ -399,9 +399,14 @@ def _may_vanish(sigma: FloatArray, lowest: FloatArray, around: int) -> BoolArray
 
 def _largest(values: FloatArray, before: int, after: int) -> FloatArray:
     """The largest of each value (n,) and its neighbours, as far as there are any."""
-    padded = np.pad(values, (before, after), constant_values=-np.inf)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, before + after + 1)
-    out: FloatArray = windows.max(axis=1)
+    none = np.full(max(before, after), -np.inf)
+    largest = np.concatenate([none[:before], values, none[:after]])
+    # Two windows make one of the double width, up to the last power of 2; then two overlap.
+    width, size = before + after + 1, 1
+    while 2 * size <= width:
+        largest = np.maximum(largest[:-size], largest[size:])
+        size *= 2
+    out: FloatArray = np.maximum(largest[: len(values)], largest[width - size :])
     return out
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.dynamics.observables import Observables
+from srm_mbs.dynamics.observables import Observables, working_elements
 from srm_mbs.errors import KnownKeys
 from srm_mbs.integration.dense_output import StepData
 
@@ -108,10 +109,6 @@ class BalancedRun(Protocol):
         """The balance at ``t``."""
 
     @property
-    def drive_forces(self) -> Mapping[str, FloatArray]:
-        """Force of each drive (n,), N or N m."""
-
-    @property
     def drive_rates(self) -> Mapping[str, FloatArray]:
         """Prescribed rate of each drive (n,), m/s or rad/s."""
 
@@ -119,38 +116,50 @@ class BalancedRun(Protocol):
         """The run at other times."""
 
 
-def _controller(run: BalancedRun, system: _System) -> Powers:
+_Nodes = Callable[[], BalancedRun]
+"""The run at the nodes of the quadrature: dense output costs more stages, so it is read only where
+something does work."""
+
+
+def _controller(nodes: _Nodes, system: _System) -> Powers:
     if not system.controlled:
         return {}
+    run = nodes()
     states = zip(run.t, run.q, run.v)
     return {"controller": np.array([system.controlled_force(*x) @ x[2] for x in states])}
 
 
-def _joints(run: BalancedRun, system: _System) -> Powers:
-    model = run.mechanism.model
+def _joints(nodes: _Nodes, system: _System) -> Powers:
+    model = system.mechanism.model
     powers = {}
     if np.any(model.damping):
-        powers["joint damping"] = (system.damping_force(run.v) * run.v).sum(axis=1)
+        v = nodes().v
+        powers["joint damping"] = (system.damping_force(v) * v).sum(axis=1)
     if np.any(model.friction):
-        powers["joint friction"] = (system.friction_force(run.v) * run.v).sum(axis=1)
+        v = nodes().v
+        powers["joint friction"] = (system.friction_force(v) * v).sum(axis=1)
     return powers
 
 
-def _elements(run: BalancedRun, system: _System) -> Powers:
+def _elements(nodes: _Nodes, system: _System) -> Powers:
     """Power of force elements; of springs and bushings without their force at rest, which has a
     potential."""
+    if not working_elements(system.mechanism):
+        return {}
+    run = nodes()
     powers = run.observables.powers(run.t, run.q, run.v)
     return {f"force {name}": power for name, power in powers.items()}
 
 
-def _drives(run: BalancedRun, system: _System) -> Powers:
-    if not run.mechanism.drives:
+def _drives(nodes: _Nodes, system: _System) -> Powers:
+    if not system.mechanism.drives:
         return {}
-    rates = run.drive_rates
-    return {f"drive {name}": force * rates[name] for name, force in run.drive_forces.items()}
+    run = nodes()
+    rates, forces = run.drive_rates, run.observables.drive_forces(run.t, run.q, run.v)
+    return {f"drive {name}": force * rates[name] for name, force in forces.items()}
 
 
-TERMS: tuple[Callable[[BalancedRun, _System], Powers], ...] = (
+TERMS: tuple[Callable[[_Nodes, _System], Powers], ...] = (
     _controller,
     _joints,
     _elements,
@@ -174,11 +183,11 @@ def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
     points, weights = GAUSS
     lengths = np.diff(ends)
     nodes = ends[:-1, None] + 0.5 * (points + 1.0) * lengths[:, None]
-    run = solution.at(nodes.ravel())
+    at_nodes = cache(lambda: solution.at(nodes.ravel()))
     works = {}
     place = np.searchsorted(ends, solution.t)
     for term in TERMS:
-        for name, power in term(run, system).items():
+        for name, power in term(at_nodes, system).items():
             pieces = 0.5 * lengths * (power.reshape(nodes.shape) @ weights)
             works[name] = np.concatenate([[0.0], np.cumsum(pieces)])[place]
     nq = solution.mechanism.model.nq

@@ -228,3 +228,10 @@ def test_a_loaded_run_with_a_controller_says_why_it_has_none(tmp_path: Path) -> 
     loaded = srm.load_solution(tmp_path / "run.npz")
     with pytest.raises(srm.InputError, match="energy balance of a loaded run with a controller"):
         loaded.energy_balance  # noqa: B018
+
+
+def test_a_balance_without_works_reads_no_dense_output(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = srm.simulate(load("n_four_bar_2"), 0.5)
+    monkeypatch.setattr(type(run), "at", lambda *_: pytest.fail("dense output was read"))
+    assert run.energy_balance.works == {}
+    assert run.energy_balance.relative < 1e-5

@@ -1,5 +1,6 @@
 // The Python module: structs that Python fills, systems, runs, dense output.
 #include <algorithm>
+#include <limits>
 #include <memory>
 #include <string>
 #include <utility>
@@ -221,6 +222,19 @@ struct PySystem {
         return owned_array(std::move(G), {n, rows, static_cast<std::size_t>(width)});
     }
 
+    // Forces (n, drives) of the drives, NaN where rows depend on each other.
+    nb::object drive_forces(const Array& t, const Array& states) {
+        const std::size_t n = count_of(t, states, state_size()), nx = state_size();
+        const std::size_t m = system->drive_count();
+        std::vector<double> out(n * m);
+        for (std::size_t i = 0; i < n; ++i) {
+            system->evaluate(t.data()[i], states.data() + i * nx, System::ZoneView{});
+            if (!system->drive_forces(out.data() + i * m))
+                std::fill_n(out.begin() + i * m, m, std::numeric_limits<double>::quiet_NaN());
+        }
+        return owned_array(std::move(out), {n, m});
+    }
+
     // The smallest singular value (n,) of the separated rows; see SeparatedRows::smallest.
     nb::object smallest_values(const SeparatedRows& rows, Algebra& algebra, const Array& t,
                                const Array& q) {
@@ -307,6 +321,7 @@ void bind_system(nb::module_& m) {
              })
         .def("closure_errors", &PySystem::closure_errors)
         .def("jacobians", &PySystem::jacobians)
+        .def("drive_forces", &PySystem::drive_forces)
         .def("smallest_values", &PySystem::smallest_values)
         .def("energies", &PySystem::energies)
         .def("powers", &PySystem::powers, nb::arg("t"), nb::arg("states"), nb::arg("elements"),

@@ -804,6 +804,15 @@ void System::multiplier(double* out) {
     projection_->unwhiten(out);
 }
 
+bool System::drive_forces(double* out) {
+    if (!closed_ || projection_->rank < data_.rows) return false;
+    std::vector<double> lam(data_.rows);
+    white_ = projection_->white_multiplier;
+    projection_->multiplier(white_.data(), lam.data());
+    for (const DrivenRow& drive : data_.drives) *out++ = -lam[drive.row] * drive.factor;
+    return true;
+}
+
 void System::correction(double* out) {
     if (!closed_) {
         std::fill(out, out + 2 * nv, 0.0);

@@ -226,6 +226,9 @@ public:
                 bool resting, double* out);
     // Of the stage evaluated last: M x (nv,), all forces but those of closures (nv,), those among
     // them but those of inertia (nv,), and Gdot v - s'' (rows,).
+    // Also then, in the order of the drives: the forces on their coordinates; false where rows
+    // depend on each other, which leaves the forces open.
+    bool drive_forces(double* out);
     void mass_times(const double* x, double* out) const;
     void working_forces(double* all, double* working);
     const std::vector<double>& bias() const { return bias_; }
@@ -233,6 +236,7 @@ public:
     bool commutes() const { return data_.groups.empty(); }
     int structural_rank() const { return data_.structural_rank; }
     bool driven() const { return !data_.drives.empty(); }
+    std::size_t drive_count() const { return data_.drives.size(); }
     // The laws of forces in linearly implicit steps: their number; their values, which evaluations
     // find while they are tracked; what acts in their place, or, if null, they themselves.  More
     // laws than degrees of freedom are one: what closures leave of their generalised forces.

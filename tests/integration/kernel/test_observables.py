@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -223,3 +225,41 @@ def test_rows_of_another_system_are_refused() -> None:
     kernel_system = both(other)[0]._kernel  # type: ignore[attr-defined]
     with pytest.raises(ValueError, match="not those of the system"):
         kernel_system.smallest_values(rows, algebra, np.zeros(1), other.q0[None])
+
+
+def driven(name: str, speeds: dict[str, float]) -> srm.Mechanism:
+    """A bundled mechanism whose joints turn at constant speeds (rad/s)."""
+    drives = tuple(srm.Drive(srm.ConstantSpeed(speed), joint) for joint, speed in speeds.items())
+    mechanism = dataclasses.replace(load(name), drives=drives)
+    start = srm.assemble(mechanism, mechanism.q0, mechanism.v0)
+    return mechanism.with_state(start.q, start.v)
+
+
+FIVE_BAR = {"crank_left": 2.0, "crank_right": -1.0}
+
+
+@pytest.mark.parametrize(("name", "speeds"), [("wiper", None), ("five_bar", FIVE_BAR)])
+def test_forces_of_drives_are_those_of_the_reference(
+    name: str, speeds: dict[str, float] | None
+) -> None:
+    mechanism = load(name) if speeds is None else driven(name, speeds)
+    run = srm.simulate(mechanism, 0.05)
+    compiled, reference = both(mechanism)
+    found = compiled.drive_forces(run.t, run.q, run.v)
+    expected = reference.drive_forces(run.t, run.q, run.v)
+    assert list(found) == list(expected) == [drive.name for drive in mechanism.drives]
+    for name, force in expected.items():
+        assert np.abs(force).max() > 0.0
+        np.testing.assert_allclose(found[name], force, rtol=0.0, atol=1e-11 * np.abs(force).max())
+
+
+def test_forces_of_drives_beside_dependent_rows_are_those_of_the_reference() -> None:
+    """One row of Bricard's mechanism depends on the others wherever it is closed."""
+    mechanism = driven("bricard", {"hinge_1": 1.0})
+    (drive,) = mechanism.drives
+    run = srm.simulate(mechanism, 0.3)
+    compiled, reference = both(mechanism)
+    found = compiled.drive_forces(run.t, run.q, run.v)[drive.name]
+    expected = reference.drive_forces(run.t, run.q, run.v)[drive.name]
+    assert np.abs(expected).max() > 0.0
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-11 * np.abs(expected).max())

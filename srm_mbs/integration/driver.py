@@ -18,7 +18,13 @@ from srm_mbs.integration.control.step_size import Proposal, StepDecision, StepSi
 from srm_mbs.integration.critical_passages import CriticalPassages
 from srm_mbs.integration.dense_output import StepData, step_data
 from srm_mbs.integration.events import EventWatch, Stop, step_dense
-from srm_mbs.integration.messages import MECHANISM, ProblemVocabulary, RunFailure, StopReason
+from srm_mbs.integration.messages import (
+    MECHANISM,
+    FailureCause,
+    ProblemVocabulary,
+    RunFailure,
+    StopReason,
+)
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
@@ -90,6 +96,8 @@ class RunRecord:
         raised.
     message
         When, why, and what to try.
+    cause
+        Of a failed run, what led to it, as far as it is known.
     error
         The exception that ended it, with its traceback; None without one.
     stop, stop_state
@@ -125,6 +133,9 @@ class RunRecord:
     watched_time: float = 0.0
     rest: tuple[float, FloatArray] | None = None
     memory: IntegratorState | None = None
+    cause: FailureCause | None = None
+    _failure: tuple[RunFailure, float, float, float, bool, ProblemVocabulary] | None = None
+    """Arguments of :meth:`mark_failed`."""
 
     def mark_finished(self, t_end: float) -> None:
         """Mark it as complete."""
@@ -168,13 +179,36 @@ class RunRecord:
         words
             How the message names the problem.
         """
-        near = f" {words.singular} (sigma = {sigma:.1e})." if sigma < NAMED_SIGMA else ""
         self.status, self.stop_reason = RunStatus.FAILED, failure.reason
-        self.message = (
-            f"Stopped at t = {t:.6g} s with step {h:.1e} s: {failure.sentence}.{near} "
-            f"Everything up to there is kept. Try a smaller {'rtol' if adaptive else 'step'}, "
-            f"another tableau, or check that {words.check}."
+        self._failure = failure, t, h, sigma, adaptive, words
+        self.message = self._failure_message()
+
+    def lead_with(self, cause: FailureCause) -> None:
+        """Let the message of a run whose steps failed begin with the ``cause``."""
+        self.cause = cause
+        self.message = self._failure_message()
+
+    def _failure_message(self) -> str:
+        if self._failure is None:
+            return self.message
+        failure, t, h, sigma, adaptive, words = self._failure
+        near = f" {words.singular} (sigma = {sigma:.1e})." if sigma < NAMED_SIGMA else ""
+        remedy = (
+            f"Try a smaller {'rtol' if adaptive else 'step'}, another tableau, or check that "
+            f"{words.check}"
         )
+        stopped = f" with step {h:.1e} s: {failure.sentence}"
+        if self.cause is not None:
+            remedy = self.cause.remedy
+            stopped = f": {self.cause.clause}. With step {h:.1e} s, {failure.sentence}"
+        return f"Stopped at t = {t:.6g} s{stopped}.{near} Everything up to there is kept. {remedy}."
+
+    @property
+    def last_state(self) -> FloatArray:
+        """State (nx,) at the end of the last step."""
+        if self.steps:
+            return self.steps[-1].state
+        return self.x0 if self.rest is None else self.rest[1]
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""

@@ -45,6 +45,14 @@ class RunFailure:
 
 
 @dataclass(frozen=True)
+class FailureCause:
+    """Why a run failed: a clause for its message, and the remedy, which begins with a verb."""
+
+    clause: str
+    remedy: str
+
+
+@dataclass(frozen=True)
 class ProblemVocabulary:
     """Phrases of messages that name the problem: its singularity, its forces, and a check."""
 

@@ -154,6 +154,11 @@ class IncrementalRun(ABC):
     def go_on_from(self, other: Self) -> None:
         """Continue as ``other``, a run of the same mechanism, would; the counts start at 0."""
 
+    @property
+    @abstractmethod
+    def steps(self) -> int:
+        """Number of inner steps."""
+
     @abstractmethod
     def _counts(self) -> tuple[int, int, int, int, int]:
         """Steps, rejected, placements, replaced, zone steps."""
@@ -236,6 +241,10 @@ class KernelRun(IncrementalRun):
         snapshot = other._run.snapshot()
         self._hold(snapshot.t, other.held.values[-1])
         self._run.restore(snapshot)
+
+    @property
+    def steps(self) -> int:
+        return int(self._run.totals()[0])
 
     def _counts(self) -> tuple[int, int, int, int, int]:
         steps, rejected, zones = self._run.totals()
@@ -329,6 +338,10 @@ class ReferenceRun(IncrementalRun):
         )
         _, _, placed, replaced, _ = self._counts()
         self._placed, self._replaced = -placed, -replaced
+
+    @property
+    def steps(self) -> int:
+        return self._steps
 
     def _counts(self) -> tuple[int, int, int, int, int]:
         placed = self._placed + sum(wrapper.placed for wrapper in self._wrappers)

@@ -69,6 +69,7 @@ from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
 from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.model.forces import LimitSpring
 from srm_mbs.model.mechanism import per_model, per_start
+from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
 from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
 from srm_mbs.simulation.options import (
     RunOptions,
@@ -136,6 +137,8 @@ class Problem:
         Makes the run: ``"python"``, ``"kernel"`` or ``"generated"``.
     held
         The forces that a sampled controller held; None without one.
+    held_watch
+        Watches them for instability; None without one.
     watch
         Looks for the events; None without any.
     passages
@@ -162,6 +165,7 @@ class Problem:
     held: HeldForce | None
     watch: EventWatch | None
     passages: CriticalPassages | None
+    held_watch: HeldForceWatch | None = None
     kernel_system: Any = None
     stream: OutputStream | None = None
     last_step: float = 0.0
@@ -192,10 +196,21 @@ def run_segment(
     record, counters, kernel_system = integrate_problem(problem)
     if before is None:
         raise_at_first_call(record.error, options.t0)
+    lead_with_cause(problem, record)
     result = assemble_result(problem, record, counters, kernel_system, result_type)
     result.message += bifurcation_sentences(result)
     log_end(mechanism.name, result)
     return result
+
+
+def lead_with_cause(problem: Problem, record: RunRecord) -> None:
+    """Let the message of a run whose steps failed begin with the cause, if it is found."""
+    if record.status is not RunStatus.FAILED or record.error is not None:
+        return
+    state = record.run.state if isinstance(record, CompiledRecord) else record.last_state
+    cause = failure_cause(problem.mechanism, *problem.system.split(state), problem.held_watch)
+    if cause is not None:
+        record.lead_with(cause)
 
 
 def raise_at_first_call(error: BaseException | None, t0: float) -> None:
@@ -445,12 +460,21 @@ def assemble_problem(
 
 
 def sampler(
-    system: OpenSystem | ClosedSystem, held: HeldForce, controller: Controller, kernel_system: Any
+    system: OpenSystem | ClosedSystem,
+    held: HeldForce,
+    watch: HeldForceWatch,
+    controller: Controller,
+    interval: float,
+    kernel_system: Any,
 ) -> Callable[[float, FloatArray], None]:
-    """A function (t, state) that samples ``controller`` for ``held`` and for the kernel."""
+    """A function (t, state) that samples ``controller`` every ``interval`` (s) for ``held`` and for
+    the kernel; ``watch`` ends the run of an unstable one."""
 
     def sample(t: float, state: FloatArray) -> None:
-        force = evaluate_controller(controller, system.mechanism, t, *system.split(state))
+        q, v = system.split(state)
+        force = evaluate_controller(controller, system.mechanism, t, q, v)
+        watch.add(force, v)
+        watch.stop_runaway(t, interval)
         held.hold(t, force)
         if kernel_system is not None:
             kernel_system.hold(t, force, True)
@@ -535,7 +559,9 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
     evaluator = None if kernel_system is None else Evaluator(system, kernel_system)
     handler = BreakpointHandler(problem.intervals, system, method, norm, evaluator)
     if problem.held is not None:
-        handler.sample = sampler(system, problem.held, options.controller, kernel_system)
+        watch = problem.held_watch = HeldForceWatch(problem.mechanism)
+        controller, interval = options.controller, float(options.sample_time)
+        handler.sample = sampler(system, problem.held, watch, controller, interval, kernel_system)
         handler.sample(t0, state)
     if evaluator is None:
         memory = start(system, method, t0, state, norm, options.t_end)
@@ -799,7 +825,7 @@ def _half_turns(names: tuple[str, ...]) -> str:
 
 def _driven_too_far(mechanism: Mechanism, record: RunRecord) -> str:
     """A sentence on drives as a possible cause of a failure; empty without them."""
-    if record.status is not RunStatus.FAILED or not mechanism.drives:
+    if record.status is not RunStatus.FAILED or not mechanism.drives or record.cause is not None:
         return ""
     names = ", ".join(drive.name for drive in mechanism.drives)
     return f" A drive ({names}) may lead where the mechanism cannot follow."

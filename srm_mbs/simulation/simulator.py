@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,10 +23,11 @@ from srm_mbs.errors import (
     safe_repr,
 )
 from srm_mbs.integration.breakpoints import smooth_intervals
-from srm_mbs.integration.generated.code import code_of_run
-from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend
+from srm_mbs.integration.kernel.backend import uses_kernel
+from srm_mbs.integration.messages import FailureCause
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
 from srm_mbs.simulation.incremental_run import IncrementalRun, KernelRun, ReferenceRun
 from srm_mbs.simulation.options import (
     SINGULAR_TOLERANCE,
@@ -46,6 +48,10 @@ NEGLIGIBLE_DT = 8.0
 RESTART_GROWTH = 1e10
 """Where a step is longer than its predecessor by this factor, its inner steps begin as at a
 start."""
+WATCHED_FORCES = 8
+"""Numbers of steps whose forces are examined where they may be unstable."""
+MANY_STEPS = 100
+"""Inner steps of one step, from which they are."""
 BREAKPOINT_ROUNDING = 1e-14
 """Distance of a breakpoint from the end of a step that is rounding, over the time."""
 
@@ -95,8 +101,9 @@ class Simulator:
         check_consistent(mechanism)
         self._mechanism, self._options = mechanism, options
         self._norm = error_norm(mechanism, options)
-        by = chosen_backend(backend, options.method, options.placement, options.singular_times)
-        self._backend, _ = code_of_run(by, backend, mechanism)
+        self._on_kernel = uses_kernel(
+            backend, options.method, options.placement, options.singular_times
+        )
         self._no_force = np.zeros(mechanism.model.nv)
         self._make()
         self.reset()
@@ -106,12 +113,13 @@ class Simulator:
         held = HeldForce()
         held.only(self._no_force)
         self._system = make_system(self._mechanism, held)
-        options = self._options._replace(backend=self._backend)
-        kind: type[IncrementalRun] = KernelRun if self._backend in COMPILED else ReferenceRun
-        self._run = kind(self._system, held, self._norm, options)
+        kind: type[IncrementalRun] = KernelRun if self._on_kernel else ReferenceRun
+        self._run = kind(self._system, held, self._norm, self._options)
         self._nq = self._mechanism.model.nq
         self._wall_time = 0.0
+        self._forces: deque[FloatArray] = deque(maxlen=WATCHED_FORCES)
         self._last_dt = math.inf
+        self._busy = False
         # Where it starts, until the first step knows what acts.
         self._pending_start: tuple[float, FloatArray] | None = None
 
@@ -167,8 +175,8 @@ class Simulator:
             For a bad ``dt`` or ``tau``; before the first step after a :meth:`reset`, also if that
             was to a singular configuration from where the motion is not determined.
         SimulationError
-            If the mechanism cannot move on: ``t``, ``q`` and ``v`` are then those of the last good
-            inner step.
+            If the mechanism cannot move on, or if ``tau`` reverses and grows step by step, with
+            rates beyond use: ``t``, ``q`` and ``v`` are then those of the last good inner step.
         """
         started = time.perf_counter()
         dt = positive(dt, "dt", " of seconds")
@@ -198,6 +206,12 @@ class Simulator:
                 raise SimulationError(f"Stopped at t = {t:.6g} s: {error}.", None) from error
             self._pending_start = None
         run = self._run
+        self._forces.append(force)
+        before = run.steps
+        if self._busy:
+            cause = self._watch().cause(dt)
+            if cause is not None:
+                raise _failed(t, cause)
         try:
             # Breakpoints at the ends count, too: forces just before and just after them differ.
             beside = BREAKPOINT_ROUNDING * (abs(t) + dt)
@@ -208,10 +222,24 @@ class Simulator:
                 run.go_on(end, -math.inf, math.inf, force, False, self._grid(dt))
         except ValueError as error:
             raise _bad_force(tau) from error
+        except SimulationError as error:
+            cause = failure_cause(self._mechanism, self.q, self.v, self._watch())
+            if cause is None:
+                raise
+            raise _failed(self.t, cause) from error
         finally:
             self._wall_time += time.perf_counter() - started
+        self._busy = run.steps - before >= MANY_STEPS
         state = run.state
         return state[: self._nq], state[self._nq :]
+
+    def _watch(self) -> HeldForceWatch:
+        """What the last forces show."""
+        watch = HeldForceWatch(self._mechanism)
+        v = self.v
+        for force in self._forces:
+            watch.add(force, v)
+        return watch
 
     def _force(self, tau: Any) -> FloatArray:
         if isinstance(tau, Mapping):
@@ -279,6 +307,8 @@ class Simulator:
             state = self._consistent(q, v, t, project)
         self._pending_start = t, state
         self._last_dt = math.inf
+        self._forces.clear()
+        self._busy = False
         return self.q, self.v
 
     def set_state(self, q: Any = None, v: Any = None, *, project: bool = False) -> None:
@@ -324,7 +354,8 @@ class Simulator:
         other = Simulator.__new__(Simulator)
         other.__dict__.update(self.__dict__)
         other._make()
-        other._last_dt = self._last_dt
+        other._forces.extend(self._forces)
+        other._last_dt, other._busy = self._last_dt, self._busy
         if self._pending_start is None:
             other._run.go_on_from(self._run)
         else:
@@ -345,6 +376,11 @@ class Simulator:
 
     def __repr__(self) -> str:
         return f"Simulator({self._mechanism.name!r}, t={self.t:.6g} s)"
+
+
+def _failed(t: float, cause: FailureCause) -> SimulationError:
+    """The error of a step that failed at ``t`` (s) by ``cause``."""
+    return SimulationError(f"Stopped at t = {t:.6g} s: {cause.clause}. {cause.remedy}.", None)
 
 
 def _bad_force(tau: Any) -> InputError:

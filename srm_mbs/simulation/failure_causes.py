@@ -1,0 +1,186 @@
+"""Causes of failures that a reader can act on: unstable sampled controllers, and drives at their
+dead points.
+
+A run fails where its steps fail, and says so; these causes come first in its message.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.local_coordinates import ChartPoint, TangentChart, tangent_basis
+from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.scaling import is_angle
+from srm_mbs.errors import ControllerError, safe_repr
+from srm_mbs.integration.messages import FailureCause
+from srm_mbs.model.coordinates import free_coordinates, joint_coordinates, position_of
+from srm_mbs.model.drives import Drive
+
+REVERSALS, RUNAWAY_REVERSALS = 3, 2
+"""Samples in a row at which a force grows and changes its sign, from which it counts as one that
+excites the motion instead of damping it: in a run that failed, and with rates beyond use."""
+RUNAWAY = 100.0
+"""Motion between two samples, in units of the coordinates, that no controller samples on purpose:
+16 turns of a joint."""
+NEAR_DEAD_POINT = 0.05
+"""Part of a driven coordinate in the motion of its mechanism, below which it is next to its dead
+point; and its largest distance from there, in its unit."""
+NEWTON_STEPS = 20
+SLOPE_STEP = 1e-4
+"""Step of the difference for the second derivative of a coordinate along the motion."""
+FLAT = 1e-9
+"""Slope of a coordinate along the motion that is zero."""
+
+
+class HeldForceWatch:
+    """Watches forces that are held from sample to sample, as those of a digital controller.
+
+    A gain that is too large for the sample time gives a force that reverses at every sample and
+    grows, with rates that grow with it, until no step is short enough.
+
+    Parameters
+    ----------
+    mechanism
+        The mechanism on which they act.
+    """
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        self._mechanism = mechanism
+        self._unit = mechanism.structure.units.coordinate
+        nv = mechanism.model.nv
+        self._force, self._reversals = np.zeros(nv), np.zeros(nv, dtype=int)
+        self._v = np.zeros(nv)
+
+    def add(self, force: FloatArray, v: FloatArray) -> None:
+        """A sample: ``force`` (nv,), N and N m, is held from now on; ``v`` (nv,) are the rates."""
+        last = self._force
+        grown = (force * last < 0.0) & (np.abs(force) > np.abs(last))
+        self._reversals = np.where(grown, self._reversals + 1, 0)
+        self._force, self._v = force, v
+
+    def cause(self, interval: float | None = None) -> FailureCause | None:
+        """The unstable controller that the last samples show; None if they show none.
+
+        With ``interval`` (s) only one whose rates are beyond use: a joint would move by more than
+        :data:`RUNAWAY` until the next sample.
+        """
+        worst = int(np.argmax(self._reversals))
+        if self._reversals[worst] < (REVERSALS if interval is None else RUNAWAY_REVERSALS):
+            return None
+        moves = np.abs(self._v) / self._unit
+        if interval is not None and not moves.max() * interval > RUNAWAY:
+            return None
+        mechanism = self._mechanism
+        force_joint, fast_joint = (_joint_of(mechanism, i) for i in (worst, int(np.argmax(moves))))
+        torque = "torque" if self._unit[worst] == 1.0 else "force"
+        force = f"{self._force[worst]:.3g}"
+        rate = f"{self._v[np.argmax(moves)]:.3g}"
+        return FailureCause(
+            f"the sampled forces are unstable: the {torque} of the joint {safe_repr(force_joint)} "
+            f"grew and changed its sign at each of the last {self._reversals[worst]} samples, to "
+            f"{force} {'N m' if torque == 'torque' else 'N'}, and the largest rate is that of "
+            f"{safe_repr(fast_joint)}, {rate} {_rate_unit(mechanism, fast_joint)}",
+            "Shorten the sample time, or lower the gains of the controller",
+        )
+
+    def stop_runaway(self, t: float, interval: float) -> None:
+        """End the run at ``t`` (s) if the rates are beyond use.
+
+        Raises
+        ------
+        ControllerError
+            With the :meth:`cause`.
+        """
+        cause = self.cause(interval)
+        if cause is not None:
+            raise ControllerError(f"{cause.clause}. {cause.remedy}", t)
+
+
+def _joint_of(mechanism: Mechanism, coordinate: int) -> str:
+    """Name of the joint that has the velocity component ``coordinate``."""
+    owners = {
+        i: name for name in mechanism.joint_names for i in joint_coordinates(mechanism, [name])
+    }
+    return owners[coordinate]
+
+
+def _rate_unit(mechanism: Mechanism, joint: str) -> str:
+    if mechanism.joint(joint).nv > 1:
+        return "(rad/s or m/s)"
+    return "rad/s" if is_angle(mechanism.model, joint) else "m/s"
+
+
+def dead_point(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> FailureCause | None:
+    """The drive that runs into its dead point at ``q`` (nq,) with ``v`` (nv,): its joint is at an
+    extreme position of the motion that the closures and the other drives leave; None if there is
+    none.  Drives that do so together are all at theirs: it is that of the fastest.
+
+    For mechanisms that are left with one degree of freedom without this drive.  On the curve of
+    their configurations, with the coordinate z, Newton's method finds dq_drive/dz = 0.
+    """
+    drives = [drive for drive in mechanism.drives if drive.joint is not None]
+    if len(drives) < len(mechanism.drives):
+        return None  # rows of driven points are not among those of the closures
+    rates = v / mechanism.structure.units.coordinate
+    for drive in sorted(
+        drives, key=lambda drive: -abs(float(rates[_coordinate_of(mechanism, drive)]))
+    ):
+        found = _dead_point_of(mechanism, drive, q, float(v[_coordinate_of(mechanism, drive)]))
+        if found is not None:
+            return found
+    return None
+
+
+def _coordinate_of(mechanism: Mechanism, drive: Drive) -> int:
+    return int(joint_coordinates(mechanism, [str(drive.joint)])[0])
+
+
+def _dead_point_of(
+    mechanism: Mechanism, drive: Drive, q: FloatArray, rate: float
+) -> FailureCause | None:
+    geometry = ClosureGeometry(mechanism, q)
+    others = [other.joint for other in mechanism.drives if other.joint and other is not drive]
+    free = free_coordinates(mechanism, others)
+    name = str(drive.joint)
+    own = _coordinate_of(mechanism, drive)
+    basis, _ = tangent_basis(geometry, q, free)
+    if basis.shape[1] != 1 or abs(basis[own, 0]) > NEAR_DEAD_POINT:
+        return None
+    chart = TangentChart(geometry, q, basis, free)
+
+    def at(z: float) -> tuple[ChartPoint | None, float]:
+        point = chart.point(np.array([z]))
+        return point, np.inf if point is None else float(point.velocities[own, 0])
+
+    z = 0.0
+    point, slope = at(z)
+    for _ in range(NEWTON_STEPS):
+        bend = (at(z + SLOPE_STEP)[1] - at(z - SLOPE_STEP)[1]) / (2.0 * SLOPE_STEP)
+        if not np.isfinite(bend) or bend == 0.0 or abs(slope) <= FLAT:
+            break
+        z -= slope / bend
+        point, slope = at(z)
+    if point is None or not (abs(slope) <= FLAT and np.isfinite(bend) and bend != 0.0):
+        return None
+    if abs(point.u[own]) > NEAR_DEAD_POINT or rate * bend >= 0.0:
+        return None
+    here = position_of(mechanism, q, name)
+    limit = here + float(point.u[own] * geometry.unit[own])
+    unit = "rad" if is_angle(mechanism.model, name) else "m"
+    most = "most" if bend < 0.0 else "least"
+    return FailureCause(
+        f"the drive {safe_repr(drive.name)} is at its dead point: the joint {safe_repr(name)} is "
+        f"at {here:.6g} {unit}, and the closures let it go to {limit:.6g} {unit} at {most}",
+        f"Let the drive turn back before {limit:.6g} {unit}, or drive another joint",
+    )
+
+
+def failure_cause(
+    mechanism: Mechanism, q: FloatArray, v: FloatArray, watch: HeldForceWatch | None
+) -> FailureCause | None:
+    """The cause of a failure at ``q`` (nq,) and ``v`` (nv,), under the forces that ``watch`` saw;
+    None if it is none of those that are known."""
+    cause = None if watch is None else watch.cause()
+    return dead_point(mechanism, q, v) if cause is None else cause

@@ -1,0 +1,157 @@
+"""Messages of runs that fail lead with the cause: unstable sampled controllers, dead points."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+import srm_mbs as srm
+from srm_mbs.errors import FailedRunWarning
+from srm_mbs.simulation.failure_causes import dead_point
+from tests.support.backends import on_both
+from tests.support.bundled import load
+
+T = 0.01
+"""Sample time (s)."""
+
+
+def damper(gain: float) -> Callable[..., Any]:
+    return lambda t, q, v: {"crank": -gain * v[0]}
+
+
+@on_both
+@pytest.mark.parametrize("gain", [1000.0, 3000.0])
+def test_an_unstable_sampled_controller_is_the_cause_that_a_run_names(
+    backend: str, gain: float
+) -> None:
+    options: dict[str, Any] = {"sample_time": T, "backend": backend}
+    with pytest.warns(FailedRunWarning):
+        solution = srm.simulate(load("four_bar"), 2.0, controller=damper(gain), **options)
+    assert re.match(
+        r"Stopped at t = 0\.0\d s: the sampled forces are unstable: the torque of the joint "
+        r"'crank' grew and changed its sign at each of the last \d samples, to \S+ N m, and the "
+        r"largest rate is that of '\w+', \S+ rad/s\. Shorten the sample time",
+        solution.message,
+    )
+    assert "locked" not in solution.message
+    torques = [force[0] for force in solution.held.values]
+    assert all(a * b < 0.0 and abs(b) > abs(a) for a, b in pairwise(torques))
+    named = float(re.search(r"samples, to (\S+) N m", solution.message).group(1))  # type: ignore[union-attr]
+    assert named == pytest.approx(-gain * solution.v[-1, 0], rel=1e-2)
+    rate = float(re.search(r", (\S+) rad/s", solution.message).group(1))  # type: ignore[union-attr]
+    assert abs(rate) == pytest.approx(np.abs(solution.v[-1]).max(), rel=1e-2)
+
+
+@on_both
+def test_a_simulator_names_forces_that_grow_with_every_step(backend: str) -> None:
+    simulator = srm.Simulator(load("four_bar"), backend=backend)
+    law = damper(1000.0)
+
+    def control() -> None:
+        for _ in range(200):
+            simulator.step(T, law(simulator.t, simulator.q, simulator.v))
+
+    with pytest.raises(srm.SimulationError, match="the torque of the joint 'crank' grew") as caught:
+        control()
+    t = simulator.t
+    assert str(caught.value).startswith(f"Stopped at t = {t:.6g} s: the sampled forces are unst")
+    # The next attempt is that of the caller, with other forces.
+    simulator.step(1e-6)
+    simulator.reset()
+    simulator.step(T, [-1.0, 0.0, 0.0])
+
+
+@on_both
+@pytest.mark.parametrize("gain", [3.0, 30.0])
+def test_stable_controllers_and_relays_run_to_the_end(backend: str, gain: float) -> None:
+    """A relay reverses at every sample as well, but does not grow."""
+    relay: Any = lambda t, q, v: {"crank": gain * (-1.0) ** round(t / T)}  # noqa: E731
+    for controller in (damper(gain), relay):
+        solution = srm.simulate(
+            load("four_bar"), 1.0, controller=controller, sample_time=T, backend=backend
+        )
+        assert solution.success
+
+
+def rocker_linkage(speed: float) -> srm.Mechanism:
+    """A linkage whose driven bar cannot turn round."""
+    return srm.planar(
+        points={"O": (0, 0), "A": (80, 0), "B": (120, 80), "C": (150, 0)},
+        bars={"crank": ("O", "A"), "coupler": ("A", "B"), "rocker": ("B", "C")},
+        ground=("O", "C"),
+        unit="mm",
+        mass_per_length=1.0,
+        drives={"O": speed},
+    )
+
+
+def largest_angle() -> float:
+    """Angle (rad) of the driven bar with coupler and rocker in line, by the law of cosines."""
+    a, b, c, ground = 80.0, math.hypot(40, 80), math.hypot(30, 80), 150.0
+    return math.acos((a**2 + ground**2 - (b + c) ** 2) / (2.0 * a * ground))
+
+
+@on_both
+@pytest.mark.parametrize("speed", [3.0, -3.0])
+@pytest.mark.parametrize("step", [None, 0.01])
+def test_a_drive_at_its_dead_point_is_named_first_with_its_limit(
+    backend: str, speed: float, step: float | None
+) -> None:
+    with pytest.warns(FailedRunWarning):
+        solution = srm.simulate(rocker_linkage(speed), 3.0, backend=backend, step=step)
+    found = re.match(
+        r"Stopped at t = \S+ s: the drive 'O' is at its dead point: the joint 'O' is at (\S+) rad, "
+        r"and the closures let it go to (\S+) rad at (most|least)\. With step",
+        solution.message,
+    )
+    assert found is not None, solution.message
+    assert float(found[1]) == pytest.approx(solution.joint("O")[0][-1], rel=1e-5)
+    assert float(found[2]) == pytest.approx(math.copysign(largest_angle(), speed), rel=1e-5)
+    assert found[3] == ("most" if speed > 0.0 else "least")
+    assert "Let the drive turn back before" in solution.message
+    assert "may lead where" not in solution.message
+
+
+@on_both
+def test_a_simulator_names_the_drive_at_its_dead_point(backend: str) -> None:
+    simulator = srm.Simulator(rocker_linkage(3.0), backend=backend)
+
+    def go_on() -> None:
+        for _ in range(300):
+            simulator.step(0.01)
+
+    with pytest.raises(srm.SimulationError, match=r"^Stopped at .*: the drive 'O' is at its dead"):
+        go_on()
+    assert simulator.t == pytest.approx(largest_angle() / 3.0, rel=1e-5)
+
+
+def test_of_two_drives_that_at_its_dead_point_is_named() -> None:
+    """The five-bar is left with one degree of freedom for each of its cranks."""
+    five_bar = load("five_bar")
+    drives = (
+        srm.Drive(srm.ConstantSpeed(0.0), "crank_left"),
+        srm.Drive(srm.ConstantSpeed(1.0), "crank_right"),
+    )
+    start = srm.assemble(replace(five_bar, drives=drives), v=None)
+    mechanism = replace(five_bar, drives=drives, q0=start.q, v0=start.v)
+    solution = srm.simulate(mechanism, 10.0)
+    assert not solution.success
+    assert "the drive 'crank_right' is at its dead point" in solution.message
+
+
+def test_no_drive_is_at_a_dead_point_on_its_way_there_or_back() -> None:
+    mechanism = rocker_linkage(3.0)
+    end = largest_angle() / 3.0
+    way = srm.simulate(mechanism, 0.99999 * end)
+    for t in (0.0, 0.5 * end, 0.95 * end):
+        assert dead_point(mechanism, *way(t)) is None
+    q, v = way(0.99999 * end)
+    assert dead_point(mechanism, q, v) is not None
+    assert dead_point(mechanism, q, -v) is None

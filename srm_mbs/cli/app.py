@@ -167,6 +167,7 @@ def simulate(
     trace: playback.Trace = None,
     gaps: playback.Gaps = False,
     reactions: playback.Reactions = False,
+    arrows: playback.Arrows = False,
     full_paths: Annotated[
         bool,
         typer.Option(
@@ -231,8 +232,8 @@ def simulate(
     playback.check_pictures(image, at, video)
 
     mechanism = _started(file.load(base=base, gravity=_vector(gravity, "--gravity")), q, v)
-    overlays = playback.overlay_options(mechanism, trace, gaps, reactions)
-    playback.check_overlays(trace, gaps, reactions, (html, image, video, play, live))
+    overlays = playback.overlay_options(mechanism, trace, gaps, reactions, arrows)
+    playback.check_overlays(trace, gaps, reactions, arrows, (html, image, video, play, live))
     added = playback.points_or_names(points)
     if added and csv is None:
         raise InputError(

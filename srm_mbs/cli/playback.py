@@ -55,6 +55,13 @@ Reactions = Annotated[
     bool, typer.Option("--reactions", help="Colour the closures by the force in them.")
 ]
 
+Arrows = Annotated[
+    bool,
+    typer.Option(
+        "--arrows", help="Draw the forces in joints and closures, of drives and force elements."
+    ),
+]
+
 
 def check_pictures(image: Path | None, at: float | None, video: Path | None) -> None:
     """Refuse image and video files that cannot be written, before the run.
@@ -101,13 +108,17 @@ def check_time(at: float | None, t_end: float, start: float = 0.0) -> None:
 
 
 def check_overlays(
-    trace: list[str] | None, gaps: bool, reactions: bool, animations: Iterable[object]
+    trace: list[str] | None,
+    gaps: bool,
+    reactions: bool,
+    arrows: bool,
+    animations: Iterable[object],
 ) -> None:
     """Refuse overlays without an animation.
 
     Parameters
     ----------
-    trace, gaps, reactions
+    trace, gaps, reactions, arrows
         Options of overlays.
     animations
         Options that ask for an animation, image or video.
@@ -119,7 +130,13 @@ def check_overlays(
     """
     if any(animations):
         return
-    for name, given in {"--trace": trace, "--gaps": gaps, "--reactions": reactions}.items():
+    overlays = {
+        "--trace": trace,
+        "--gaps": gaps,
+        "--reactions": reactions,
+        "--arrows": arrows,
+    }
+    for name, given in overlays.items():
         if given:
             raise InputError(
                 "it is drawn in the animation, and none is asked for",
@@ -129,7 +146,7 @@ def check_overlays(
 
 
 def overlay_options(
-    mechanism: Mechanism, trace: list[str] | None, gaps: bool, reactions: bool
+    mechanism: Mechanism, trace: list[str] | None, gaps: bool, reactions: bool, arrows: bool
 ) -> dict[str, Any]:
     """The overlays as options of playback, checked before a long run.
 
@@ -142,8 +159,8 @@ def overlay_options(
     from srm_mbs.visualization.animation.overlays import ViewOptions
 
     anchors = given_points(trace or [], "--trace")
-    ViewOptions(anchors, gaps, reactions).check(mechanism)
-    return {"trace": anchors, "gaps": gaps, "reactions": reactions}
+    ViewOptions(anchors, gaps, reactions, arrows).check(mechanism)
+    return {"trace": anchors, "gaps": gaps, "reactions": reactions, "arrows": arrows}
 
 
 def points_or_names(texts: list[str] | None) -> list[srm_mbs.Anchor | str]:
@@ -194,6 +211,7 @@ def play(
     trace: Trace = None,
     gaps: Gaps = False,
     reactions: Reactions = False,
+    arrows: Arrows = False,
     allow_outside: AllowOutside = False,
 ) -> None:
     """Play a saved run in the browser.
@@ -203,7 +221,7 @@ def play(
     check_pictures(image, at, video)
     solution = srm_mbs.load_solution(run, allow_outside=allow_outside)
     check_time(at, solution.span[1], solution.span[0])
-    options = overlay_options(solution.mechanism, trace, gaps, reactions)
+    options = overlay_options(solution.mechanism, trace, gaps, reactions, arrows)
     if image is None and video is None:
         play_run(solution, options)
         return

@@ -421,7 +421,7 @@ def test_simulate_can_play_the_run_at_once(monkeypatch: pytest.MonkeyPatch) -> N
     (((solution,), options),) = played
     assert solution.t[-1] == 0.1
     anchor = srm.Anchor("crank", xyz=(1.0, 0.0, 0.0))
-    assert options == {"trace": [anchor], "gaps": True, "reactions": False}
+    assert options == {"trace": [anchor], "gaps": True, "reactions": False, "arrows": False}
 
 
 @POSIX

@@ -276,7 +276,7 @@ def calls(folder: Path) -> dict[str, Call]:
         "Solution.export_html": Call(
             solution.export_html,
             (folder / "r.html",),
-            {"trace": (), "gaps": False, "reactions": False},
+            {"trace": (), "gaps": False, "reactions": False, "arrows": False},
         ),
         "Solution.report": Call(
             solution.report,

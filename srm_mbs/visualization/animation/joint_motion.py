@@ -47,6 +47,7 @@ class AnimationMixin:
         trace: Sequence[Anchor] = (),
         gaps: bool = False,
         reactions: bool = False,
+        arrows: bool = False,
     ) -> None:
         """Play the motion in the browser; see
         :func:`srm_mbs.visualization.animation.playback.play`.
@@ -65,6 +66,8 @@ class AnimationMixin:
             Draw the gaps of the closures, exaggerated by a factor that the panel gives.
         reactions
             Colour the closures by the magnitude of their reaction force.
+        arrows
+            Draw the forces and moments in joints and closures, of drives and of force elements.
 
         Raises
         ------
@@ -75,7 +78,7 @@ class AnimationMixin:
         from srm_mbs.visualization.animation.overlays import ViewOptions
         from srm_mbs.visualization.animation.playback import play
 
-        view = ViewOptions(trace, gaps, reactions)
+        view = ViewOptions(trace, gaps, reactions, arrows)
         play(self._drawable, fps=fps, open_browser=open_browser, block=block, view=view)
 
     def show(
@@ -86,6 +89,7 @@ class AnimationMixin:
         trace: Sequence[Anchor] = (),
         gaps: bool = False,
         reactions: bool = False,
+        arrows: bool = False,
         panel: bool = True,
     ) -> Embedded:
         """The animation as the output of a notebook cell; see
@@ -95,7 +99,7 @@ class AnimationMixin:
         ----------
         height
             Of the frame, pixels.
-        fps, trace, gaps, reactions, panel
+        fps, trace, gaps, reactions, arrows, panel
             As for :meth:`export_html`.
 
         Raises
@@ -106,7 +110,7 @@ class AnimationMixin:
         from srm_mbs.visualization.animation.overlays import ViewOptions
         from srm_mbs.visualization.animation.playback import show_in_notebook
 
-        view = ViewOptions(trace, gaps, reactions)
+        view = ViewOptions(trace, gaps, reactions, arrows)
         return show_in_notebook(self._drawable, height=height, fps=fps, view=view, panel=panel)
 
     def export_html(
@@ -117,6 +121,7 @@ class AnimationMixin:
         trace: Sequence[Anchor] = (),
         gaps: bool = False,
         reactions: bool = False,
+        arrows: bool = False,
         panel: bool = True,
     ) -> None:
         """Write a self-contained page with the animation; see
@@ -126,7 +131,7 @@ class AnimationMixin:
         ----------
         path
             Name of the file, usually ``.html``; an existing one is replaced.
-        fps, trace, gaps, reactions
+        fps, trace, gaps, reactions, arrows
             As for :meth:`play`.
         panel
             Whether the page has the panel and the marks of singular passages.
@@ -140,7 +145,7 @@ class AnimationMixin:
         from srm_mbs.visualization.animation.overlays import ViewOptions
         from srm_mbs.visualization.animation.playback import export_html
 
-        view = ViewOptions(trace, gaps, reactions)
+        view = ViewOptions(trace, gaps, reactions, arrows)
         export_html(self._drawable, checked_path(path), fps=fps, view=view, panel=panel)
 
     def export_image(
@@ -153,6 +158,7 @@ class AnimationMixin:
         trace: Sequence[Anchor] = (),
         gaps: bool = False,
         reactions: bool = False,
+        arrows: bool = False,
     ) -> None:
         """Write a picture at one time; see
         :func:`srm_mbs.visualization.animation.video.export_image`.
@@ -169,7 +175,7 @@ class AnimationMixin:
             ``"page"`` (7 inch) are two thirds as high as wide.
         dpi
             Dots per inch, for print; 300 with a name of a size.
-        trace, gaps, reactions
+        trace, gaps, reactions, arrows
             As for :meth:`play`.
 
         Raises
@@ -181,7 +187,7 @@ class AnimationMixin:
         from srm_mbs.visualization.animation.overlays import ViewOptions
         from srm_mbs.visualization.animation.video import export_image
 
-        view = ViewOptions(trace, gaps, reactions)
+        view = ViewOptions(trace, gaps, reactions, arrows)
         export_image(self._drawable, path, t=t, size=size, dpi=dpi, view=view)
 
     def export_video(
@@ -195,6 +201,7 @@ class AnimationMixin:
         trace: Sequence[Anchor] = (),
         gaps: bool = False,
         reactions: bool = False,
+        arrows: bool = False,
     ) -> None:
         """Write a video; see :func:`srm_mbs.visualization.animation.video.export_video`.
 
@@ -210,7 +217,7 @@ class AnimationMixin:
             Width and height in pixels.
         progress
             True for a progress bar, or a callable (done, total).
-        trace, gaps, reactions
+        trace, gaps, reactions, arrows
             As for :meth:`play`.
 
         Raises
@@ -223,7 +230,7 @@ class AnimationMixin:
         from srm_mbs.visualization.animation.overlays import ViewOptions
         from srm_mbs.visualization.animation.video import export_video
 
-        view = ViewOptions(trace, gaps, reactions)
+        view = ViewOptions(trace, gaps, reactions, arrows)
         export_video(
             self._drawable, path, fps=fps, speed=speed, size=size, progress=progress, view=view
         )

@@ -175,6 +175,7 @@ class LiveView:
         trace: Sequence[Anchor] = (),
         gaps: bool = False,
         reactions: bool = False,
+        arrows: bool = False,
     ) -> None:
         """Play the run in the same page.
 
@@ -182,7 +183,7 @@ class LiveView:
         ----------
         solution
             The run.
-        trace, gaps, reactions
+        trace, gaps, reactions, arrows
             The overlays, as for :meth:`srm_mbs.Solution.play`.
 
         Raises
@@ -190,7 +191,7 @@ class LiveView:
         InputError
             If the server does not answer, or has stopped, or an overlay cannot be drawn.
         """
-        picture = make_picture(solution, 60.0, ViewOptions(trace, gaps, reactions))
+        picture = make_picture(solution, 60.0, ViewOptions(trace, gaps, reactions, arrows))
         data = page_data(solution, picture)
         with self.visualizer.window.answering(REPLY_TIME, SERVER_GONE_REMEDY):
             self.visualizer["/about"].set_property("about", json.dumps(data, allow_nan=False))

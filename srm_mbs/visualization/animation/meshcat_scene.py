@@ -129,9 +129,11 @@ class _Drawing:
         """The shapes of the bodies, and the motion of the joints that carry them."""
         names, root = node_names(self.picture.mechanism), self.scene["/mechanism"]
         self._centre(root)
-        drawn = {visual.joint for visual in self.picture.visuals} - {0}
+        moved = {visual.joint for visual in self.picture.visuals} - {0}
+        if self.picture.overlays.arrows is not None:  # which start at points of the bodies
+            moved.update(arrow.joint for arrow in self.picture.overlays.arrows.arrows)
         for k, joint in enumerate(self.motion.joints):
-            if joint in drawn:
+            if joint in moved:
                 positions, quaternions = self.motion.positions[:, k], self.motion.quaternions[:, k]
                 self._animate(root[names[joint]], position=positions, quaternion=quaternions)
         for number, visual in enumerate(self.picture.visuals):

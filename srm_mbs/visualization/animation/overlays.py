@@ -21,6 +21,7 @@ from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.forces import SpringDamper
 from srm_mbs.model.numbers import flag
 from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.visualization.animation.arrows import Arrows, arrows_of
 from srm_mbs.visualization.animation.shapes import Colour, Cylinder, Mesh, Shape, Sphere
 from srm_mbs.visualization.animation.trajectory import (
     ActiveIntervals,
@@ -76,11 +77,14 @@ class ViewOptions:
         Draw the gaps of the closures, exaggerated by a factor that the panel gives.
     reactions
         Colour the closures by the magnitude of their reaction force, with a legend in the panel.
+    arrows
+        Draw the forces and moments in joints and closures, of drives and of force elements.
     """
 
     trace: Sequence[Anchor] = ()
     gaps: bool = False
     reactions: bool = False
+    arrows: bool = False
 
     def check(self, *mechanisms: Mechanism) -> None:
         """Refuse overlays that none of ``mechanisms``, those of a run, has.
@@ -91,6 +95,7 @@ class ViewOptions:
             As :meth:`anchors`, or if gaps or reactions are requested and no closure has anchors.
         """
         self.anchors(mechanisms[0])
+        flag(self.arrows, "arrows")
         loops = [loop for mechanism in mechanisms for loop in mechanism.loops]
         for element, requested in (("gaps", self.gaps), ("reactions", self.reactions)):
             if flag(requested, element) and not any(loop.anchors for loop in loops):
@@ -156,15 +161,17 @@ class Trace:
 
 @dataclass
 class Overlays:
-    """The overlays of a picture: animated shapes, paths, and their notes in the panel."""
+    """The overlays of a picture: animated shapes, paths, arrows, and their notes in the panel."""
 
     shapes: list[AnimatedShape] = field(default_factory=list)
     traces: list[Trace] = field(default_factory=list)
     notes: list[dict[str, Any]] = field(default_factory=list)
+    arrows: Arrows | None = None
+    arrow_ends: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
 
     def points(self) -> FloatArray:
         """Points (n, 3) m that must be in view of the camera."""
-        parts = [np.empty((0, 3)), *(trace.points for trace in self.traces)]
+        parts = [self.arrow_ends, *(trace.points for trace in self.traces)]
         return np.concatenate([*parts, *(shape.positions for shape in self.shapes)])
 
 
@@ -184,6 +191,8 @@ def overlay_joints(motion: DrawableMotion, options: ViewOptions) -> set[int]:
     anchors = options.anchors(motion.mechanism)
     for spring, _ in active_springs(motion):
         anchors += [spring.a.resolve(model), spring.b.resolve(model)]
+    if options.arrows:
+        return set(range(1, model.njoints))
     if options.reactions or options.gaps:
         for loop, _ in active_closures(motion):
             anchors += loop.resolve(model) if loop.anchors else ()
@@ -227,6 +236,10 @@ def make_overlays(
             shapes, note = draw(motion, bodies, extent)
             out.shapes += shapes
             out.notes.append(note)
+    if options.arrows:
+        out.arrows = arrows_of(motion, bodies, extent)
+        out.arrow_ends = out.arrows.ends(bodies)
+        out.notes.append(out.arrows.note())
     return out
 
 

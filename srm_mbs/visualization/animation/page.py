@@ -46,7 +46,7 @@ MAX_JOINT_NUMBERS = 24_000
 """Positions and rates of all joints together: some 200 kB in a page."""
 FEWEST_JOINT_SAMPLES = 50
 """Times of the positions and rates of mechanisms of very many joints."""
-SCRIPTS = ("page.js", "bodies.js", "curves.js", "passages.js", "ground.js")
+SCRIPTS = ("page.js", "arrows.js", "bodies.js", "curves.js", "passages.js", "ground.js")
 """Files of :data:`FOLDER` that are the script of the page, in this order."""
 GROUND_GAP = 2e-3
 """Distance of the ground from the lowest point of the motion, over the height of the picture."""
@@ -75,8 +75,9 @@ def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -
     Returns
     -------
     dict
-        Those of :func:`values_over_time`, and ``start`` (s), ``panel``, ``notes``, ``bodies``
-        with the name of each node that has shapes, ``ground``, ``aspect``, ``background``.
+        Those of :func:`values_over_time`, and ``start`` (s), ``panel``, ``notes``, ``arrows``,
+        ``bodies`` with the name of each node that has shapes, ``ground``, ``aspect`` and
+        ``background``.
     """
     times = picture.motion.times
     data: dict[str, Any] = {"times": [], "joint_times": [], "values": [], "passages": []}
@@ -86,6 +87,7 @@ def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -
         "start": float(times[0]),
         "panel": panel,
         "notes": picture.overlays.notes,
+        "arrows": _arrows(picture),
         "bodies": _bodies(picture) if panel else [],
         "ground": _ground(picture) if panel else None,
         "aspect": ASPECT,
@@ -109,6 +111,11 @@ def _ground(picture: Picture) -> dict[str, Any] | None:
     # Not within the shapes that lie on it.
     height = float((points @ up).min()) - GROUND_GAP * width
     return {"up": up.tolist(), "height": height, "size": width}
+
+
+def _arrows(picture: Picture) -> dict[str, Any] | None:
+    arrows = picture.overlays.arrows
+    return None if arrows is None else arrows.data(node_names(picture.mechanism))
 
 
 def _bodies(picture: Picture) -> list[dict[str, str]]:

@@ -938,7 +938,9 @@ def test_what_cannot_be_drawn_is_refused_before_the_run(
     assert "steps" not in said
 
 
-@pytest.mark.parametrize("options", [["--trace", "rod:1,0,0"], ["--gaps"], ["--reactions"]])
+@pytest.mark.parametrize(
+    "options", [["--trace", "rod:1,0,0"], ["--gaps"], ["--reactions"], ["--arrows"]]
+)
 def test_what_would_be_drawn_nowhere_is_refused_before_the_run(options: list[str]) -> None:
     said = run("simulate", "slider_crank", *options, status=2)
     assert f"error: {options[0]}: it is drawn in the animation" in said

@@ -65,6 +65,15 @@ at_layout.push(() => {
   element("scale").hidden = !about.panel;
 });
 
+// Length (m) of a pixel at the middle of the picture, 0 while there is none.
+function pixel_size() {
+  const camera = viewer.camera, high = pane.clientHeight;
+  camera.updateMatrixWorld();
+  const middle = viewer.controls.target.clone().applyMatrix4(camera.parent.matrixWorld);
+  const distance = Math.abs(middle.applyMatrix4(camera.matrixWorldInverse).z);
+  return high && 2 * distance * Math.tan(camera.fov * Math.PI / 360) / camera.zoom / high;
+}
+
 // Axes and scale change with the camera only.
 let last_view = "";
 at_frame.push(() => {
@@ -76,10 +85,7 @@ at_frame.push(() => {
   const view = `${matrix.map((x) => x.toPrecision(6))} ${high}`;
   if (view === last_view || !high) return;
   last_view = view;
-  const middle = viewer.controls.target.clone().applyMatrix4(camera.parent.matrixWorld);
-  const distance = Math.abs(middle.applyMatrix4(camera.matrixWorldInverse).z);
-  const pixel = 2 * distance * Math.tan(camera.fov * Math.PI / 360) / camera.zoom / high;
-  const length = round_length(110 * pixel);
+  const pixel = pixel_size(), length = round_length(110 * pixel);
   element("length").style.width = `${length / pixel}px`;
   const units = [[1, "m"], [1e-3, "mm"], [1e-6, "\u00b5m"]];
   const [size, unit] = units.find(([size]) => length >= 0.999 * size) ?? units[2];

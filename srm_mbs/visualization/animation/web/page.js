@@ -68,6 +68,18 @@ function fill_panel() {
   }
   for (const note of about.notes) {
     add(notes, "div", { textContent: note.text });
+    for (const { colour, text } of note.keys ?? []) {
+      const key = add(notes, "div", { className: "key" });
+      add(key, "span").style.background = colour;
+      add(key, "span", { textContent: text });
+    }
+    for (const kind of note.bars ?? []) {
+      const bar = add(notes, "div", { className: "bar" });
+      bar.dataset.kind = kind;
+      add(bar, "span");
+      add(bar, "span");
+    }
+    if (note.more) add(notes, "div", { textContent: note.more });
     if (!note.ramp) continue;
     const background = `linear-gradient(to right, ${note.ramp.join(", ")})`;
     add(notes, "div", { className: "ramp" }).style.background = background;
@@ -77,7 +89,7 @@ function fill_panel() {
   element("panel").hidden = !about.panel && !about.notes.length;
 }
 
-const times_of = (value) => value.body ? about.joint_times : about.times;
+const times_of = (value) => value.times ?? (value.body ? about.joint_times : about.times);
 
 function value_at(value, time) {
   const samples = value.samples, times = times_of(value);

@@ -234,7 +234,7 @@ class Simulator:
         return state[: self._nq], state[self._nq :]
 
     def _watch(self) -> HeldForceWatch:
-        """What the last forces show."""
+        """The signs of an unstable controller in the forces of the last samples."""
         watch = HeldForceWatch(self._mechanism)
         v = self.v
         for force in self._forces:

@@ -157,7 +157,7 @@ def arrows_in(solution: srm.Solution) -> Arrows:
 
 def test_a_spring_has_an_arrow_at_each_end_that_is_its_law() -> None:
     solution = srm.simulate(load("flyball_governor"), 0.5)
-    model, found = solution.mechanism.model, arrows_in(solution)
+    found = arrows_in(solution)
     spring = next(f for f in solution.mechanism.forces if isinstance(f, srm.SpringDamper))
     first, second = (a for a in found.arrows if a.label == f"force of {spring.name}")
     frame = len(found.times) // 2

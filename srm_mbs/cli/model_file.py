@@ -111,7 +111,19 @@ def parameter_values(given: Sequence[str]) -> dict[str, float]:
     Raises
     ------
     InputError
-        If one is none, or names a parameter again.
+        As :func:`named_numbers`.
+    """
+    return named_numbers(given, "parameters", "parameter", "crank")
+
+
+def named_numbers(given: Sequence[str], element: str, what: str, example: str) -> dict[str, float]:
+    """The texts ``NAME=VALUE`` of the argument ``element``; messages call a name ``what``, and
+    ``example`` is one.
+
+    Raises
+    ------
+    InputError
+        If one is none, or a name is given again.
     """
     values: dict[str, float] = {}
     for text in given:
@@ -121,12 +133,12 @@ def parameter_values(given: Sequence[str]) -> dict[str, float]:
         except ValueError as error:
             raise InputError(
                 f"{text!r} is not a name and a number",
-                element="parameters",
-                remedy="Give it as crank=0.3",
+                element=element,
+                remedy=f"Give it as {example}=0.3",
             ) from error
         if name in values:
             raise InputError(
-                f"the parameter {name!r} is given twice", element="parameters", remedy="Keep one"
+                f"the {what} {name!r} is given twice", element=element, remedy="Keep one"
             )
         values[name] = number
     return values

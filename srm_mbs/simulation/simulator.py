@@ -23,7 +23,8 @@ from srm_mbs.errors import (
     safe_repr,
 )
 from srm_mbs.integration.breakpoints import smooth_intervals
-from srm_mbs.integration.kernel.backend import uses_kernel
+from srm_mbs.integration.generated.code import code_of_run
+from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend
 from srm_mbs.integration.messages import FailureCause
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -101,9 +102,8 @@ class Simulator:
         check_consistent(mechanism)
         self._mechanism, self._options = mechanism, options
         self._norm = error_norm(mechanism, options)
-        self._on_kernel = uses_kernel(
-            backend, options.method, options.placement, options.singular_times
-        )
+        by = chosen_backend(backend, options.method, options.placement, options.singular_times)
+        self._backend, _ = code_of_run(by, backend, mechanism)
         self._no_force = np.zeros(mechanism.model.nv)
         self._make()
         self.reset()
@@ -113,8 +113,9 @@ class Simulator:
         held = HeldForce()
         held.only(self._no_force)
         self._system = make_system(self._mechanism, held)
-        kind: type[IncrementalRun] = KernelRun if self._on_kernel else ReferenceRun
-        self._run = kind(self._system, held, self._norm, self._options)
+        options = self._options._replace(backend=self._backend)
+        kind: type[IncrementalRun] = KernelRun if self._backend in COMPILED else ReferenceRun
+        self._run = kind(self._system, held, self._norm, options)
         self._nq = self._mechanism.model.nq
         self._wall_time = 0.0
         self._forces: deque[FloatArray] = deque(maxlen=WATCHED_FORCES)

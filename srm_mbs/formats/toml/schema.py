@@ -19,6 +19,7 @@ import pydantic
 from pydantic import BaseModel, ConfigDict, PlainValidator, StrictBool, StrictStr, create_model
 from pydantic_core import PydanticCustomError
 
+from srm_mbs.model.actuators import Actuator
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive
@@ -172,6 +173,7 @@ DriveEntry: Any = _entry(
     "One ``[[drive]]``: the motion that is prescribed, and the keys of its law.",
     {**_LAW, **_NAME, **_keys(Drive, ("law", "name"))},
 )
+ActuatorEntry: Any = _entry("ActuatorEntry", "One of ``[actuators]``.", _keys(Actuator))
 CSV_KEYS = {"torque": TABLE_KEYS, "wrench": TABLE_KEYS[:2]}
 """Keys by which forces take their values over time from a CSV file."""
 
@@ -348,5 +350,6 @@ class TopEntry(StrictEntry):
     drive: list[DriveEntry] = []
     points: dict[StrictStr, AnchorEntry] = {}
     override: list[OverrideEntry] = []
+    actuators: dict[StrictStr, ActuatorEntry] = {}
     initial: InitialEntry = InitialEntry()
     simulation: SimulationEntry = SimulationEntry()

@@ -34,6 +34,7 @@ STYLES = {
     "reduced_radau": ("#000000", "d", "-.", 1.2),
     "reduced_cvode": ("#D55E00", "h", "-.", 1.2),
     "reduced_ida": ("#E69F00", "p", ":", 1.2),
+    "taylor": ("#56B4E9", "H", "-", 1.2),
 }
 OTHER = ("#777777", ".", "-", 1.0)
 SHOWN_ERRORS = (1e-13, 10.0)

@@ -375,7 +375,7 @@ def test_loops_hung_on_each_other_run_as_with_the_largest_pivots(
     def run() -> tuple[srm.Mechanism, srm.Solution]:
         mechanism = hung(seed, 24)
         # Two passages are 2e-4 s apart: between the stages of a longer step they are listed as one.
-        run = srm.simulate(mechanism, 0.4, rtol=1e-8, max_step=1e-3, backend="kernel")
+        run = srm.simulate(mechanism, 0.4, rtol=1e-8, max_step=2e-4, backend="kernel")
         return mechanism, run
 
     mechanism, found = run()

@@ -53,7 +53,7 @@ class TimeConstant:
 
 
 def time_constants(mechanism: Mechanism) -> list[TimeConstant]:
-    """Those of all joints and force elements at the start, the shortest first.
+    """Time constants of all joints and force elements at the start, the shortest first.
 
     Joints without damping and friction, and elements that neither damp nor store energy, have none;
     nor has what closures and drives hold.
@@ -80,8 +80,8 @@ def time_constants(mechanism: Mechanism) -> list[TimeConstant]:
 
 
 def stiff_elements(mechanism: Mechanism) -> list[TimeConstant]:
-    """Those of :func:`time_constants` that are below STIFF_PART of the characteristic time; none
-    where the start cannot be evaluated."""
+    """Time constants of :func:`time_constants` that are below STIFF_PART of the characteristic
+    time; none where the start cannot be evaluated."""
     try:
         found = time_constants(mechanism)
     except EvaluationError:  # in gimbal lock, which is reported where it matters

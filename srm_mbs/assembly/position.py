@@ -62,7 +62,7 @@ class ClosureProblem(ClosureGeometry):
 
     @cached_property
     def _unambiguous(self) -> list[IndexArray]:
-        """Of each loop, the rows whose only zeros are the intended closed configurations.
+        """For each loop, the rows whose only zeros are the intended closed configurations.
 
         Where a closure matches axes, the zeros of its alignments also have them reversed.
         """

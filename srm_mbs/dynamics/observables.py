@@ -48,7 +48,8 @@ def working_elements(mechanism: MechanismData) -> dict[str, ForceKinematics]:
 
 @per_model
 def conservative_elements(mechanism: MechanismData) -> dict[str, ForceKinematics]:
-    """Those of them whose force at rest has a potential: its power is subtracted from theirs."""
+    """The working elements whose force at rest has a potential: its power is subtracted from
+    theirs."""
     return {
         force.name: ForceKinematics(mechanism.model, [force])
         for force in mechanism.forces

@@ -173,7 +173,7 @@ def _tables(entries: Any) -> Iterator[str]:
 
 
 def _elsewhere(names: Iterable[str], written: Path) -> list[str]:
-    """Those of the paths ``names`` that are out of reach of the description ``written``."""
+    """The paths among ``names`` that are out of reach of the description ``written``."""
     reach = Reach.of(written)
     found = []
     for name in dict.fromkeys(names):

@@ -71,7 +71,7 @@ class Overrides:
     parameters: Mapping[str, float] = field(default_factory=dict)
 
     def entries(self) -> dict[str, Any]:
-        """Those that are keys of a description, which a saved run and a conversion keep."""
+        """The options that are keys of a description, which a saved run and a conversion keep."""
         given = {"massless": self.massless, "closing_tolerance": self.closing_tolerance}
         if isinstance(self.massless, Mapping):
             given["massless"] = dict(self.massless)

@@ -47,7 +47,7 @@ ROOT = re.compile(r"<([^\s/><!?]++)")
 OPAQUE = re.compile(r"<!--|<!\[CDATA\[|<\?")
 """Beginnings of parts in which no tag is read."""
 ENDS = {"<!--": "-->", "<![CDATA[": "]]>", "<?": "?>"}
-"""Of each such part, where it ends."""
+"""The end of each such part, by its beginning."""
 NULL_END = "null characters at the end of the file are left out, as tinyxml reads it"
 DASHES = "comments with -- inside, which XML does not allow, are skipped as tinyxml skips them"
 LATE_DECLARATION = (
@@ -387,7 +387,7 @@ class _ShallowTree(TreeBuilder):
 
 
 def _too_deep(tag: str) -> InputError:
-    """Of elements nested deeper than the readers, which recurse, can follow."""
+    """The error for elements nested deeper than the readers, which recurse, can follow."""
     return InputError(
         f"more than {LARGEST_NESTING} elements are nested",
         element=f"<{shortened(tag)}>",

@@ -722,7 +722,7 @@ class CriticalPassages:
         return steps
 
     def steps_on(self, t: float, state: FloatArray, end: float) -> list[tuple[StepResult, float]]:
-        """As :meth:`steps_past`, on from where the passage stopped, at ``t`` (s)."""
+        """The steps of :meth:`steps_past` from where the passage stopped, at ``t`` (s)."""
         begun, self._rest = self._rest, None
         if begun is None:
             return []

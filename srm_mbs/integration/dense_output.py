@@ -187,8 +187,8 @@ class HermiteStep:
         return sorted(before + after)
 
     def _away(self, count: int) -> list[int]:
-        """As :meth:`_nodes`, without ends whose rates may carry rounding; all if few others are
-        near, or none on one side of the step: polynomials are no extrapolations."""
+        """Nodes as of :meth:`_nodes`, without ends whose rates may carry rounding; all if few
+        others are near, or none on one side of the step: polynomials are no extrapolations."""
         away = self._nodes(count, BRANCH_SIGMA, AWAY_REACH)
         within = len(away) >= LEAST_AWAY and away[0] <= self._step < away[-1]
         return away if within else self._nodes(count)

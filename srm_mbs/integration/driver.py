@@ -57,7 +57,7 @@ class RunStatus(StrEnum):
     INTERRUPTED = "interrupted"
     """By Ctrl-C."""
     FAILED = "failed"
-    """It could not continue, or a function of the user raised."""
+    """The run could not continue, or a function of the user raised."""
 
     def __repr__(self) -> str:
         return repr(self.value)

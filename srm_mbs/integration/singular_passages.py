@@ -105,7 +105,7 @@ SAMPLES = 21
 
 @per_model
 def _singular_values(mechanism: MechanismData) -> SingularValues:
-    """Those of the separated rows of closures and drives."""
+    """Singular values of the separated rows of closures and drives."""
     return SingularValues(separated_pattern(mechanism))
 
 
@@ -146,8 +146,8 @@ class ConstraintMonitor:
         return self.geometry.normalised_rows(self._jacobians(t))
 
     def near_null_spaces(self, G: FloatArray, active: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Those of the ``active`` rows G (k, n) of the normalised ones that vanish at a singular
-        configuration, left (k, k - r) and right (n, n - r)."""
+        """Null spaces of the ``active`` rows G (k, n) of the normalised ones that vanish at a
+        singular configuration, left (k, k - r) and right (n, n - r)."""
         return self._values.of_rows(active).near_null_spaces(G, self.rank)
 
     def _jacobians(self, t: FloatArray) -> FloatArray:
@@ -270,7 +270,7 @@ class Crossing:
 
     @property
     def configuration(self) -> FloatArray | None:
-        """That configuration (nq,)."""
+        """The exactly singular configuration nearest to the passage (nq,)."""
         return None if self.singular is None else self.singular.q[: self._monitor.geometry.model.nq]
 
     @cached_property

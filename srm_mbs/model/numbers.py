@@ -11,7 +11,8 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, safe_repr
 
 LARGEST_MAGNITUDE = 1e30
-"""Of a number in a file, in SI units: the squares of larger ones may overflow in sums."""
+"""Largest magnitude of a number in a file, in SI units: the squares of larger ones may overflow in
+sums."""
 
 
 def finite_array(values: Any, shape: tuple[int | None, ...] | None = None) -> FloatArray | None:

@@ -53,7 +53,8 @@ LONGEST_SENTENCE = 100_000
 MOST_ELEMENTS = 10_000
 """Closures, forces, drives, points or actuators of a mechanism."""
 LARGEST_NUMBER = 1e100
-"""Of an array of a run: where runs end because products of larger ones overflow."""
+"""Largest magnitude in an array of a run: where runs end because products of larger ones
+overflow."""
 JOIN_TOLERANCE = 1e-9
 """Distance between the end of a step and where its rates lead, over the size of the state and of
 the terms: rounding leaves 1e-14."""

@@ -325,8 +325,8 @@ def load_result(path: Path, types: ResultTypes[R], reach: Reach = NO_REACH) -> R
 
 
 def load_from(file: IO[bytes], path: Path, types: ResultTypes[R], reach: Reach = NO_REACH) -> R:
-    """As :func:`load_result`, from an open file; ``path`` names it, and its folder is searched for
-    meshes."""
+    """The result that :func:`load_result` reads, from an open file; ``path`` names it, and its
+    folder is searched for meshes."""
     with _naming(str(path)):
         archive = Archive(file)
         if CONTENTS in archive.names:

@@ -153,15 +153,16 @@ class ClosureGeometry:
         return out
 
     def separated(self, q: FloatArray) -> FloatArray:
-        """As :meth:`normalised`, with the difference in place of one of two nearly parallel rows of
-        closures between the same bodies, scaled to their norm.
+        """G as from :meth:`normalised`, with the difference in place of one of two nearly parallel
+        rows of closures between the same bodies, scaled to their norm.
 
         Otherwise a singular value that is small everywhere would hide singular configurations."""
         return self._separate(self.normalised(q))
 
     def normalised_rows(self, jacobians: FloatArray) -> FloatArray:
-        """As :meth:`normalised`, from the rows (..., rows, n) of unscaled Jacobians, of closures
-        and drives (:meth:`srm_mbs.dynamics.observables.Observables.jacobians`)."""
+        """G as from :meth:`normalised`, computed from the rows (..., rows, n) of unscaled
+        Jacobians, of closures and drives
+        (:meth:`srm_mbs.dynamics.observables.Observables.jacobians`)."""
         return jacobians * self.row_factors
 
     @cached_property
@@ -170,7 +171,8 @@ class ClosureGeometry:
         return self.unit / (self.row_unit * self.row_size)[:, None]
 
     def separated_rows(self, jacobians: FloatArray) -> FloatArray:
-        """As :meth:`separated`, from the rows that :meth:`normalised_rows` takes."""
+        """G as from :meth:`separated`, computed from the rows that :meth:`normalised_rows`
+        takes."""
         return self._separate(self.normalised_rows(jacobians))
 
     def bias(self, q: FloatArray, u: FloatArray) -> FloatArray:

@@ -76,7 +76,7 @@ class Reactions:
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Those of the same mechanism at the states of all ``parts``, one after the other."""
+        """Reactions of the same mechanism at the states of all ``parts``, one after the other."""
         tables = ([getattr(part, field.name) for part in parts] for field in fields(cls))
         return cls(
             *(

@@ -465,7 +465,7 @@ class SingularValues:
         return [np.flatnonzero(row).tolist() for row in self._pattern]
 
     def of_rows(self, active: BoolArray) -> SingularValues:
-        """Those of matrices that consist of the ``active`` rows (rows,)."""
+        """Singular values of matrices that consist of the ``active`` rows (rows,)."""
         key = active.tobytes()
         if key not in self._parts:
             self._parts[key] = SingularValues(self._pattern[active])

@@ -545,7 +545,7 @@ class ReusableAnalysis:
 
     @classmethod
     def of(cls, mechanism: MechanismData) -> ReusableAnalysis | None:
-        """That of ``mechanism``; None if its closures have no rank, or an uncertain one."""
+        """The analysis of ``mechanism``; None if its closures have no rank, or an uncertain one."""
         structure = structure_of(mechanism)
         walked = None if structure.notes else _walked(structure, mechanism)
         if walked is None:

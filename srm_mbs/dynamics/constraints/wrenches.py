@@ -48,7 +48,7 @@ class Placements:
 
     @classmethod
     def at(cls, model: pin.Model, data: pin.Data, q: FloatArray) -> Self:
-        """Those at the configurations q (n, nq); ``data`` is a workspace."""
+        """The wrenches at the configurations q (n, nq); ``data`` is a workspace."""
         placed = cls.empty(model, len(q))
         for i, row in enumerate(q):
             pin.forwardKinematics(model, data, row)

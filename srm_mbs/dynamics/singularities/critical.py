@@ -31,7 +31,7 @@ DIFFERENCE = 1e-5
 CONVERGED = 1e-14
 """Size of the equations of a critical configuration at which the search ends."""
 DECIDED = 1e-8
-"""That at which the residual, which is stationary, is known to rounding."""
+"""Distance at which the residual, which is stationary, is known to rounding."""
 ACCEPTED = 1e-11
 """Size of them from which the search has failed."""
 FROZEN = 1e-3

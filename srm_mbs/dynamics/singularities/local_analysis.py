@@ -223,7 +223,7 @@ class Participants:
 
 
 def participants(geometry: ClosureGeometry, left: FloatArray) -> Participants:
-    """Those of the left null vectors ``left`` (rows, k) of the normalised G."""
+    """The participants in the left null vectors ``left`` (rows, k) of the normalised G."""
     takes_part = (np.linalg.norm(left, axis=1) > PARTICIPATES).tolist()
     loops = geometry.mechanism.loops
     rows = [(name, loop.name) for loop in loops for name in loop.row_names]

@@ -105,7 +105,7 @@ class BodyReader:
 
     @property
     def values(self) -> MjcfValues:
-        """Those of the file that is being read, at the end the main one."""
+        """The values of the file that is being read, at the end the main one."""
         return self._part.values
 
     def world(self, node: Element) -> None:

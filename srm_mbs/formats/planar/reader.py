@@ -47,7 +47,7 @@ from srm_mbs.formats.translation import Options, Translation, urdf_text
 from srm_mbs.model.anchors import WORLD
 
 HINGE_AXIS = (0.0, -1.0, 0.0)
-"""Of all pins."""
+"""Axis of all pins, in the axes of the world."""
 WIDTH = 0.02
 """Width of a bar as it is drawn, over the size of the drawing."""
 LAW_VALUES: Mapping[str, tuple[str, ...]] = {

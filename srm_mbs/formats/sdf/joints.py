@@ -53,9 +53,9 @@ LIMITS = {"lower": "lower", "upper": "upper", "effort": "effort", "speed": "velo
 LIMIT_IGNORED = ("stiffness", "dissipation")
 DRAKE_MIMIC = re.compile(r"\{[^}]*drake[^}]*\}mimic")
 ANGLE_COSINE_TOLERANCE = 1e-9
-"""Of the cosine of the angle between two axes that are parallel or perpendicular."""
+"""Rounding of the cosine of the angle between two axes that are parallel or perpendicular."""
 GEAR_AXIS_TOLERANCE = 1e-6
-"""Of the cosine of the angle between the axes of a gearbox and of a hinge."""
+"""Rounding of the cosine of the angle between the axes of a gearbox and of a hinge."""
 SECOND_AXIS_SUFFIX = "::axis2"
 """Suffix of the joint of a second axis that is a joint of its own."""
 

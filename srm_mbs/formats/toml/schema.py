@@ -65,7 +65,7 @@ def _direction(value: Any) -> float | list[float] | list[str]:
 
 Number = Annotated[float, PlainValidator(_number)]
 Direction = Annotated[float | list[float] | list[str], PlainValidator(_direction)]
-"""Of the plane: an angle against x, two components, or the names of two points."""
+"""A direction in the plane: an angle against x, two components, or the names of two points."""
 Massless = Annotated[str | dict[str, float], PlainValidator(_massless)]
 Positive = Annotated[Number, pydantic.Field(gt=0)]
 NotNegative = Annotated[Number, pydantic.Field(ge=0)]

@@ -178,7 +178,7 @@ def constants() -> Any:
 
 
 CONSTANTS: Any = None if core is None else constants()
-"""Those of every run; a field that :func:`constants` lacks is an error on import."""
+"""The constants of every run; a field that :func:`constants` lacks is an error on import."""
 
 
 @lru_cache(maxsize=64)
@@ -387,7 +387,8 @@ def dense_structs(scheme: ButcherTableau) -> tuple[SchemeDense, Any]:
 
 @lru_cache(maxsize=64)
 def scheme_denses(scheme: ButcherTableau) -> list[SchemeDense]:
-    """Those of a run: of ``scheme`` and, where it has one, of its scheme for stiff problems."""
+    """The dense outputs of a run: of ``scheme`` and, where it has one, of its scheme for stiff
+    problems."""
     return [scheme_dense(one) for one in (scheme, scheme.stiff) if one is not None]
 
 

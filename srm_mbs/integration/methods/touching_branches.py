@@ -41,7 +41,7 @@ SAMPLES = 8
 LEAST_SIGMA = 1e-3
 """sigma of the nodes, at least."""
 FIRST_NODE_SIGMA = 3e-3
-"""That of the first ones."""
+"""sigma of the first nodes."""
 MAX_CLOSINGS = 12
 """Newton steps of one node onto the closures."""
 LARGEST_CLOSING = 0.5

@@ -41,7 +41,7 @@ GROUND_COLOUR: Colour = (0.55, 0.57, 0.60, 1.0)
 PIN_COLOUR: Colour = (0.15, 0.16, 0.18, 1.0)
 ANCHOR_COLOUR: Colour = (0.835, 0.369, 0.000, 1.0)
 BAR_THICKNESS = 0.025
-"""Of the mechanism's extent, in drawings without visuals."""
+"""Thickness of a bar over the mechanism's extent, in drawings without visuals."""
 
 
 @dataclass(frozen=True)

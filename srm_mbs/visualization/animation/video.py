@@ -47,7 +47,7 @@ BROWSER_OPTIONS = (
 )
 """Options of Chromium without a graphics card and without a network."""
 TEMPORARY_PREFIX = "srm-mbs-"
-"""Of the names of temporary folders, which have the page and the profile of the browser."""
+"""Prefix of the names of temporary folders, which have the page and the profile of the browser."""
 LOCKING_TIME = 60.0
 """Age (s) of a temporary folder above which its program has locked it, unless it was killed."""
 _SMOOTH = """() => {

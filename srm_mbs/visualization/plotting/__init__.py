@@ -56,13 +56,13 @@ KINDS: Kinds = {
     "point": draw_points,
     "poses": draw_poses,
 }
-"""Those of a run of a mechanism."""
+"""Kinds of plots of a run of a mechanism."""
 
 COMMON = ("title", "size", "dpi")
 """Options of every kind."""
 
 DAE_KINDS: Kinds = {"run": draw_dae_run, "state": draw_dae_state}
-"""Those of a run of a DAE."""
+"""Kinds of plots of a run of a DAE."""
 
 
 def check_options(kind: str, options: Iterable[str] = (), kinds: Kinds = KINDS) -> None:
@@ -105,7 +105,7 @@ def plot_dae(
 
 
 def given_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of ``options`` that differ from their defaults, None and False."""
+    """The ``options`` that differ from their defaults, None and False."""
     return {name: value for name, value in options.items() if not (value is None or value is False)}
 
 

@@ -56,7 +56,7 @@ FEW_POINTS = 50
 TICK_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 """Leading digits of the distance of ticks."""
 ANGLE_STEPS = (1.0, 1.5, 3.0, 4.5, 9.0, 10.0)
-"""Those of an axis in degrees."""
+"""Steps between the ticks of an axis in degrees."""
 PLAIN_POWERS = range(-2, 4)
 """Powers of ten whose values are written in full at the ticks."""
 SMALLEST_RELATIVE_RANGE = 1e-6

@@ -163,7 +163,7 @@ def default_places(solution: SimulationResult, run: SimulationResult) -> Places:
 
 
 def _different(run: SimulationResult, places: Places, least: float) -> Places:
-    """Those of the ``places`` whose path has an extent above ``least`` (m), each point once."""
+    """The ``places`` whose path has an extent above ``least`` (m), each point once."""
     found: dict[str, FloatArray] = {}
     for name, path in _paths(run, places).items():
         moves = bool(np.ptp(path, axis=0).max() > least)

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from srm_mbs._typing import FloatArray
 
 COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY)
-"""Of the bodies, in the order of the joints; they repeat."""
+"""Colours of the bodies, in the order of the joints; they repeat."""
 PATHS: tuple[tuple[str, Any], ...] = ((VERMILION, "-"), (BLACK, (0, (4, 1.5))), (GREY, "-"))
 """Colours and dashes of the paths; they repeat."""
 DEFAULT_POSES = 6
@@ -77,7 +77,7 @@ HEIGHTS = (2.4, 8.0)
 MARGIN = 0.08
 """Room around the mechanism, over its size."""
 TIME_TOLERANCE = 1e-13
-"""Of the time at which the crank has an angle, over the span of the run."""
+"""Tolerance of the time at which the crank has an angle, over the span of the run."""
 UNITS = {"m": 1.0, "mm": 1e3}
 
 

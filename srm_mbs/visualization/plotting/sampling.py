@@ -74,8 +74,8 @@ def read_smoothly(solution: SimulationResult, most: int = MAX_PIECES) -> Simulat
 def read_forces(
     solution: SimulationResult, read: Callable[[Any], Any], most: int = MAX_PIECES
 ) -> SimulationResult:
-    """As :func:`read_smoothly`; without the end of a failed run if ``read``, which needs the
-    equations of motion, cannot be evaluated there.
+    """Values as of :func:`read_smoothly`; without the end of a failed run if ``read``, which needs
+    the equations of motion, cannot be evaluated there.
 
     Raises
     ------

@@ -25,7 +25,7 @@ Answer = Callable[[Terms, int], tuple[FloatArray, FloatArray]]
 """(terms, node) -> tangent rate and multiplier there; the equation that a sweep integrates."""
 
 INTERPOLATIONS = ("auto", "linear")
-"""Those of SRM; PSRM has ``"stages"`` as well."""
+"""Interpolations of SRM; PSRM has ``"stages"`` as well."""
 GOOD_EXTENSION = 4
 """Order from which an extension is used to interpolate the multiplier."""
 ROTATION_MARGIN = 2.0

@@ -97,6 +97,16 @@ def test_no_module_imports_private_names_of_another(module: str) -> None:
             assert not private, f"{module} imports {private} from {node.module}"
 
 
+INTEGRATION = [module for module in MODULES if module.startswith("integration.")]
+
+
+@pytest.mark.parametrize("module", INTEGRATION)
+def test_integration_asks_the_protocol_of_systems_not_their_classes(module: str) -> None:
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance":
+            assert not re.search(r"System\b", ast.unparse(node.args[1])), ast.unparse(node)
+
+
 def loaded_by(statement: str) -> set[str]:
     code = f"import sys\n{statement}\nprint(*sorted(sys.modules), sep='\\n')"
     run = subprocess.run(

@@ -226,6 +226,7 @@ class DaeSystem:
     time_dependent = True
     laws = np.zeros(0)
     singularities = None
+    branch_system = None
 
     def __init__(
         self,

@@ -47,7 +47,13 @@ from srm_mbs.dynamics.forces import (
 from srm_mbs.dynamics.manifold import Manifold
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import constraint_units
-from srm_mbs.dynamics.system import AccelerationDerivatives, SingularityAnalysis, Terms, Zone
+from srm_mbs.dynamics.system import (
+    AccelerationDerivatives,
+    BranchSystem,
+    SingularityAnalysis,
+    Terms,
+    Zone,
+)
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.mechanism import per_model, per_start
 
@@ -499,6 +505,7 @@ class OpenSystem(Mechanics):
     has_constraints = False
     factorisations = 0
     singularities = None
+    branch_system = None
 
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
@@ -643,6 +650,11 @@ class ClosedSystem(Mechanics):
     def singularities(self) -> SingularityAnalysis:
         """Data for the analysis of singular configurations."""
         return _singularities(self.mechanism)
+
+    @property
+    def branch_system(self) -> BranchSystem:
+        """The system itself."""
+        return self
 
     @property
     def factorisations(self) -> int:

@@ -3,8 +3,8 @@
 A *state* is one flat array; a mechanism uses x = (q, v) of length nq + nv.  A *tangent* is an
 array of the size of the system's tangent space; a mechanism uses (dq, dv) of length 2 nv with
 dq in the Lie algebra of the configuration manifold.  Integration is written once against this
-contract.  It looks inside a state only where a system offers :attr:`System.singularities`, the
-optional capability of mechanisms with closures.
+contract.  It looks inside a state only where a system offers :attr:`System.singularities` and
+:attr:`System.branch_system`, the optional capabilities of mechanisms with closures.
 
 :func:`onto_closures` moves a state of any system onto its closures.
 """
@@ -207,6 +207,11 @@ class System(Protocol):
         """Data for the analysis of singular configurations; None without closures, and for DAEs,
         whose equations are known at single points only."""
 
+    @property
+    def branch_system(self) -> BranchSystem | None:
+        """The system itself, where stages can be solved on their branch; None without closures, and
+        for DAEs."""
+
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
         """Factorise at one stage.
 
@@ -261,6 +266,49 @@ class System(Protocol):
     def past_jump(self, t: float, state: FloatArray) -> float:
         """Time (s) by which a step to ``state`` at ``t`` (s) passed a jump of forces, estimated
         there: 0 up to rounding, negative before it, infinite without an estimate."""
+
+
+class BranchTerms(Terms, Protocol):
+    """The quantities of one evaluated stage from which branches of closed configurations are
+    computed next to a singular configuration."""
+
+    def free_acceleration(self) -> FloatArray:
+        """M^-1 f (nv,)."""
+
+    def momentum(self, v: FloatArray) -> FloatArray:
+        """M v (nv,)."""
+
+    def multiplier_of(self, a: FloatArray) -> FloatArray:
+        """E (G a + Gdot v - s'') (nv,) of the free acceleration ``a`` (nv,)."""
+
+    def driven_residuals(self) -> FloatArray:
+        """g - s of the rows of the drives."""
+
+    def closing(self, allowed: FloatArray) -> FloatArray:
+        """E g (nv,), without ``allowed`` of the rows of the drives."""
+
+    def branch_tangents(self) -> FloatArray:
+        """M-orthonormal velocities (nv, k) that satisfy the closures, whatever the drives."""
+
+
+class BranchSystem(System, Protocol):
+    """A mechanism with closures, whose stages next to a singular configuration are solved on their
+    branch of the closed configurations."""
+
+    nv: int
+
+    @property
+    def singularities(self) -> SingularityAnalysis:
+        """Data for the analysis of singular configurations."""
+
+    def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> BranchTerms:
+        """As :meth:`System.evaluate`."""
+
+    def working_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
+        """Generalised forces (nv,) that do work: all but those of inertia and of closures."""
+
+    def inertial_force(self, q: FloatArray, v: FloatArray) -> FloatArray:
+        """-C(q, v) v (nv,): Coriolis and centrifugal forces."""
 
 
 MAX_NEWTON_STEPS = 30

@@ -25,7 +25,7 @@ from srm_mbs.formats.toml.parameters import given_parameters, resolved
 from srm_mbs.formats.translation import Options, merged
 from srm_mbs.formats.urdf.override import override, without_overrides
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
-from srm_mbs.model.mechanism import Source, variant_maker
+from srm_mbs.model.mechanism import Source, SourceTexts, variant_maker
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array, name_list
 from srm_mbs.model.reach import Reach
 
@@ -143,9 +143,9 @@ def _translated(
         description = check_description(entries, own.file)
         as_read = False
     gravity = description.gravity if overrides.gravity is None else overrides.gravity
-    source = Source.with_texts_later(
-        partial(str, own.text) if as_read else partial(tomli_w.dumps, entries),
-        lambda: translation.urdf,
+    text = own.text if as_read else partial(tomli_w.dumps, entries)
+    source = Source(
+        SourceTexts(text, lambda: translation.urdf),
         urdf_path=translation.urdf_file or model.file,
         path=own.file,
         base=description.base if base is None else base,
@@ -169,7 +169,7 @@ def _of_description(
     reading, model = _of_tables(own, entries, description, overrides, reach, urdf)
     return replace(
         reading,
-        source=reading.source.with_parameters(values),
+        source=replace(reading.source, parameters=values),
         notes=(*reading.notes, *notes),
         variants=_Variants(given, overrides, reach, model) if values else None,
     )

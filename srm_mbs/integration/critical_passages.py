@@ -23,12 +23,12 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.singularities.critical import (
     CriticalConfiguration,
     CurveThroughSaddle,
     critical_configuration,
 )
+from srm_mbs.dynamics.system import BranchSystem, System
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.control.branch_guard import may_cross
 from srm_mbs.integration.control.placement import zero_within
@@ -270,7 +270,7 @@ class PassageAlongCurve:
         leads away from it, has more freedom, or turns back for want of energy.
     """
 
-    system: ClosedSystem
+    system: BranchSystem
     critical: CriticalConfiguration
     t: float
     state: FloatArray
@@ -286,7 +286,7 @@ class PassageAlongCurve:
 
     def __post_init__(self) -> None:
         geometry = self.critical.geometry
-        q, v = self.system.split(self.state)
+        q, v = self.system.singularities.split(self.state)
         self._nv = len(v)
         self._driven = len(geometry.unit) > self._nv
         place, rates = geometry.at(q, self.t), geometry.rates(v)
@@ -592,7 +592,7 @@ class ExaminedPassage:
 
 
 def examined_passages(
-    system: ClosedSystem | OpenSystem,
+    system: System,
     method: Method,
     norm: ErrorNorm,
     placement: str,
@@ -601,11 +601,12 @@ def examined_passages(
     """The examination of the passages of a run; None where steps make them all: without closures,
     without automatic placement, in sweeps and in large mechanisms."""
     split = isinstance(method, PSRM) and method.correction == "split"
-    if not (isinstance(system, ClosedSystem) and split and placement == "automatic"):
+    branch_system = system.branch_system
+    if branch_system is None or not split or placement != "automatic":
         return None
-    if system.nv > LARGEST:
+    if branch_system.nv > LARGEST:
         return None
-    return CriticalPassages(system, method.scheme, norm, tolerance)
+    return CriticalPassages(branch_system, method.scheme, norm, tolerance)
 
 
 class CriticalPassages:
@@ -625,7 +626,7 @@ class CriticalPassages:
     """
 
     def __init__(
-        self, system: ClosedSystem, scheme: ButcherTableau, norm: ErrorNorm, tolerance: float
+        self, system: BranchSystem, scheme: ButcherTableau, norm: ErrorNorm, tolerance: float
     ) -> None:
         self._system, self._scheme, self._norm = system, scheme, norm
         self._tolerance = tolerance
@@ -784,7 +785,7 @@ class CriticalPassages:
             correction=np.zeros(2 * system.nv),
             error_ratio=0.0,
             sigmas=sigmas[i] + along * (sigmas[i + 1] - sigmas[i]),
-            rank=system.structure.rank,
+            rank=system.singularities.rank,
             state_scale=system.state_scale(states[i + 1]),
             placement="critical",
         )

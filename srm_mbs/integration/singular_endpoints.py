@@ -27,7 +27,6 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
-from srm_mbs.dynamics.multibody import ClosedSystem
 from srm_mbs.dynamics.singularities.branch_limit import BranchCurve, BranchLimit, branch_next_to
 from srm_mbs.dynamics.singularities.branches import branch_tangents
 from srm_mbs.dynamics.singularities.local_analysis import SingularConfiguration
@@ -560,8 +559,9 @@ def start(
     multiplier = limit.multiplier(v, free)
     rate = np.concatenate([v, free - multiplier])
     history = MultiplierHistory.begin(t, multiplier)
-    if motion.is_slow(rate) and _uses_nodes(method) and isinstance(system, ClosedSystem):
-        nodes = BranchNodes(system)
+    branch_system = system.branch_system
+    if motion.is_slow(rate) and _uses_nodes(method) and branch_system is not None:
+        nodes = BranchNodes(branch_system)
         away = nodes.spaced(t, state, limit.direction[: len(unit)] * unit)
         history, memory.lingering = replace(history, away=away), away is not None
     elif begins or memory.sigma < LARGEST_ZONE_SIGMA:

@@ -12,7 +12,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import update_wrapper
+from functools import cached_property, update_wrapper
 from types import MappingProxyType
 from typing import Any, Generic, Protocol, Self, TypeVar
 
@@ -43,13 +43,46 @@ from srm_mbs.model.validation import (
     without,
 )
 
-_TEXTS = ("description", "urdf")
-"""Fields of a source that may be made later."""
-
 # References to files by their full name, as in filename="/home/author/arm.stl".
 _FOLDER = r"(?:file://)?(?:/|[A-Za-z]:[\\/])(?:[^\"'<>\n]*[\\/])?"
 _FILE_KEYS = "urdf|sdf|mjcf|gepetto|table|file|filename"
 _FULL_NAME = re.compile(rf"""(\b(?:{_FILE_KEYS})\s*=\s*["']){_FOLDER}(?=[^"'/\\])""")
+
+
+class SourceTexts:
+    """The texts of a source.
+
+    Parameters
+    ----------
+    description, urdf
+        The texts of the TOML description and of the URDF, or functions that make them when they are
+        first asked for: most runs need neither.
+    """
+
+    def __init__(self, description: str | Callable[[], str], urdf: str | Callable[[], str]) -> None:
+        self._description, self._urdf = description, urdf
+
+    @cached_property
+    def description(self) -> str:
+        """Text of the TOML description."""
+        return self._description if isinstance(self._description, str) else self._description()
+
+    @cached_property
+    def urdf(self) -> str:
+        """Text of the URDF as it was read."""
+        return self._urdf if isinstance(self._urdf, str) else self._urdf()
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, SourceTexts):
+            return NotImplemented
+        return (self.description, self.urdf) == (other.description, other.urdf)
+
+    def __hash__(self) -> int:
+        return hash((self.description, self.urdf))
+
+    def __reduce__(self) -> tuple[type[SourceTexts], tuple[str, str]]:
+        """As texts: functions that make them may not be pickled."""
+        return SourceTexts, (self.description, self.urdf)
 
 
 @dataclass(frozen=True)
@@ -58,10 +91,8 @@ class Source:
 
     Attributes
     ----------
-    description
-        Text of the TOML description.
-    urdf
-        Text of the URDF as it was read.
+    texts
+        The description and the URDF.
     urdf_path
         Where that URDF lay, for mesh files relative to it; may be gone when a run is replayed.
     path
@@ -76,8 +107,7 @@ class Source:
         Values of the parameters of the description; ``description`` has numbers in their place.
     """
 
-    description: str
-    urdf: str
+    texts: SourceTexts
     urdf_path: str
     path: str
     base: str
@@ -94,41 +124,25 @@ class Source:
                 remedy="Give allow_outside to the function that loads it",
             )
 
-    @classmethod
-    def with_texts_later(
-        cls, description: Callable[[], str], urdf: Callable[[], str], /, **others: Any
-    ) -> Self:
-        """A source whose texts are made when they are first asked for: most runs need neither."""
-        made = object.__new__(cls)
-        defaults = cls("", "", **others)
-        for key in fields(cls):
-            if key.name not in _TEXTS:
-                object.__setattr__(made, key.name, getattr(defaults, key.name))
-        object.__setattr__(made, "_texts", {"description": description, "urdf": urdf})
-        return made
+    @property
+    def description(self) -> str:
+        """Text of the TOML description."""
+        return self.texts.description
 
-    def with_parameters(self, values: Mapping[str, float]) -> Self:
-        """The same source with the ``values`` of its parameters."""
-        made = object.__new__(type(self))
-        made.__dict__.update(self.__dict__)  # not its fields: texts are made when asked for
-        object.__setattr__(made, "parameters", values)
-        return made
-
-    def __getattr__(self, name: str) -> str:
-        """A text that was not made yet: Python asks here for missing attributes only."""
-        if name not in _TEXTS or "_texts" not in self.__dict__:
-            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}", name=name)
-        text: str = self.__dict__["_texts"][name]()
-        object.__setattr__(self, name, text)
-        return text
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {key.name: getattr(self, key.name) for key in fields(self)}
+    @property
+    def urdf(self) -> str:
+        """Text of the URDF as it was read."""
+        return self.texts.urdf
 
     def entries(self) -> dict[str, Any]:
-        """The fields that are saved: all but the reach."""
-        saved = {key.name: getattr(self, key.name) for key in fields(self) if key.name != "reach"}
-        return saved | {"parameters": dict(self.parameters)}
+        """The texts and the fields that are saved: all but the reach."""
+        others = (key.name for key in fields(self) if key.name not in ("texts", "reach"))
+        return {
+            "description": self.description,
+            "urdf": self.urdf,
+            **{name: getattr(self, name) for name in others},
+            "parameters": dict(self.parameters),
+        }
 
     def without_folders(self, text: str) -> str:
         """``text`` of its files or about them, with the files of the model named relative to its

@@ -49,7 +49,7 @@ from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement
 from srm_mbs.model.laws import Curve, Law, Samples
-from srm_mbs.model.mechanism import SimulationDefaults, Source
+from srm_mbs.model.mechanism import SimulationDefaults, Source, SourceTexts
 from srm_mbs.model.model_data import model_from_data, model_to_data
 from srm_mbs.model.pinocchio_archive import model_from_archive
 from srm_mbs.model.reach import Reach
@@ -468,7 +468,8 @@ def _source(entry: saved_run.SourceEntry, path: Path, reach: Reach) -> Source:
         "urdf_path": str(path.parent / file_name(entry.urdf_path)),
         "reach": reach,
     }
-    return Source(**values)
+    texts = SourceTexts(values.pop("description"), values.pop("urdf"))
+    return Source(texts, **values)
 
 
 def _mechanism(run: saved_run.RunEntry, arrays: Arrays, path: Path, reach: Reach) -> Mechanism:

@@ -26,7 +26,7 @@ from __future__ import annotations
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.multibody import ClosedSystem
+from srm_mbs.dynamics.system import BranchSystem
 from srm_mbs.integration.methods.touching_branches import TOUCHING, StageOnBranch, TouchingBranch
 
 BRANCH_SIGMA = 3e-3
@@ -67,7 +67,7 @@ _SLOPE = np.array([-0.8, 0.8, 0.2, -0.2, -4 / 105, 4 / 105, 1 / 280, -1 / 280])
 class BranchNodes(StageOnBranch):
     """Solves stages of ``system`` by nodes of their branch: after :meth:`solve` it is the stage."""
 
-    def __init__(self, system: ClosedSystem) -> None:
+    def __init__(self, system: BranchSystem) -> None:
         self._system = system
 
     def _sigma_at(self, t: float, state: FloatArray, move: FloatArray) -> float:
@@ -195,7 +195,7 @@ class StageNodes(BranchNodes):
 
     def __init__(
         self,
-        system: ClosedSystem,
+        system: BranchSystem,
         t: float,
         state: FloatArray,
         rate: FloatArray,

@@ -24,7 +24,6 @@ from functools import lru_cache
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.multibody import ClosedSystem
 from srm_mbs.dynamics.system import System, Zone
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.branch_nodes import BRANCH_SIGMA, StageNodes
@@ -141,8 +140,9 @@ class SplitStep:
         zone = None
         if history is not None and start < WATCHED_SIGMA + FAR_STEPS * sigma_change:
             weights = norm.weights(memory.state_scale)
-            if memory.lingering and self.uses_nodes and isinstance(system, ClosedSystem):
-                nodes = StageNodes(system, t, state, memory.rate, history.away)
+            branch_system = system.branch_system
+            if memory.lingering and self.uses_nodes and branch_system is not None:
+                nodes = StageNodes(branch_system, t, state, memory.rate, history.away)
             lingers = nodes is not None
             branch = BranchStages(
                 system, memory, norm, weights, h, sigma_change, history, t + h, lingering=lingers

@@ -25,7 +25,7 @@ import math
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.multibody import ClosedSystem
+from srm_mbs.dynamics.system import BranchSystem
 
 TOUCHING = 0.1
 """Distance (rad, scene diagonals) of the first nodes from the middle between them, at least.  A
@@ -92,7 +92,7 @@ class StageOnBranch:
 class TouchingBranch:
     """Solves the stages of one step by the nodes of their branch."""
 
-    def __init__(self, system: ClosedSystem) -> None:
+    def __init__(self, system: BranchSystem) -> None:
         self._system = system
         self._nodes: list[FloatArray] = []
 
@@ -101,7 +101,7 @@ class TouchingBranch:
         (2 nv,), in the direction w (nv,); whether there are any."""
         system, nv = self._system, self._system.nv
         w = w / system.position_norm(w)
-        self._along = w / system.mechanism.structure.units.coordinate**2
+        self._along = w / system.singularities.coordinate_unit**2
         self._along /= self._along @ w
         v, a = rate[:nv], rate[nv:]
         speed = float(self._along @ v)

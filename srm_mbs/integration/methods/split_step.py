@@ -207,31 +207,6 @@ class SplitStep:
             if branch is not None and moved is not None:
                 correction = correction + moved
 
-        # Error estimate.
-        sigmas = np.array(all_sigmas)
-        error_ratio = 0.0
-        if scheme.error is not None:
-            error = h * (scheme.error @ rates)
-            weights = norm.weights(np.maximum(memory.state_scale, state_scale))
-            k = system.multiplier_part.start
-            speeds = system.friction_tolerance(np.zeros(k))[k:]
-            if np.isfinite(speeds).any():
-                ends = np.array([memory.rate, end_rate])
-                unseen = reversal_error(h, ends[:, :k], ends[:, k:], speeds)
-                error[k:] = np.maximum(np.abs(error[k:]), unseen)
-            if scheme.implicit is not None:
-                weights = np.minimum(weights, system.friction_tolerance(end_rate[:k]))
-            if branch is not None and history is not None:
-                if deficient and sigma_change > UNCERTAINTY_SIGMA_CHANGE:
-                    error = np.abs(error)
-                    for j, *_ in deficient:
-                        if j < s:
-                            uncertainty = history.uncertainty(t + scheme.c[j] * h)
-                            error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
-                direct_from = BRANCH_SIGMA if nodes is not None and nodes.used else 0.0
-                weights = branch.widened(weights, scheme, sigmas, direct_from)
-            error_ratio = norm(error, weights)
-
         result = StepResult(
             t=t,
             h=h,
@@ -239,8 +214,8 @@ class SplitStep:
             rates=rates,
             end_rate=end_rate,
             correction=correction,
-            error_ratio=error_ratio,
-            sigmas=sigmas,
+            error_ratio=0.0,
+            sigmas=np.array(all_sigmas),
             rank=terms.rank,
             state_scale=state_scale,
             multiplier=multiplier,
@@ -248,16 +223,12 @@ class SplitStep:
             stiffness=stages.stiffness,
             laws=stages.laws,
         )
-        explicit = scheme.stable_to is not None and branch is None and norm.negligible > 0.0
-        if explicit:
-            change_of_rate = rates[s] - rates[s - 1]
-            result.stiffness = stiffness_of(system, h, delta - before, change_of_rate)
-        if explicit or scheme.implicit is not None:
-            k = system.multiplier_part.start
-            v = np.array([memory.rate[:k], end_rate[:k]])
-            rubs = np.isfinite(system.friction_tolerance(end_rate[:k])[k:])
-            if chatters(h, v, rates[:, k:], norm.weights(memory.state_scale)[k:], rubs):
-                result.stiffness = np.inf
+        direct_from = BRANCH_SIGMA if nodes is not None and nodes.used else 0.0
+        result.error_ratio = self._error_ratio(
+            system, memory, norm, result, branch, deficient, direct_from
+        )
+        last_motion = delta - before if branch is None else None
+        result.stiffness = self._stiffness(system, memory, norm, result, last_motion)
         due = memory.steps < RESIDUAL_EVERY or memory.steps % RESIDUAL_EVERY == 0
         if due and history is not None and theta == 1.0 and away is None:
             result.constraint_residual = terms.constraint_residual()
@@ -274,6 +245,78 @@ class SplitStep:
             result.held = any(held for *_, held in deficient)
             result.zone, result.history = zone, history
         return result
+
+    def _error_ratio(
+        self,
+        system: System,
+        memory: IntegratorState,
+        norm: ErrorNorm,
+        result: StepResult,
+        branch: BranchStages | None,
+        deficient: list[tuple[int, int, bool]],
+        direct_from: float,
+    ) -> float:
+        """Norm of the embedded error estimate over the tolerance; 0 for schemes without one.
+
+        Parameters
+        ----------
+        branch
+            Next to a singular configuration; None elsewhere.
+        deficient
+            Stage, rank, and whether it was held, of the stages whose multiplier is predicted.
+        direct_from
+            sigma above which stages were solved directly, without nodes of their branch.
+        """
+        scheme, t, h, history = self.scheme, result.t, result.h, memory.history
+        if scheme.error is None:
+            return 0.0
+        error = h * (scheme.error @ result.rates)
+        weights = norm.weights(np.maximum(memory.state_scale, result.state_scale))
+        k = system.multiplier_part.start
+        speeds = system.friction_tolerance(np.zeros(k))[k:]
+        if np.isfinite(speeds).any():
+            ends = np.array([memory.rate, result.end_rate])
+            unseen = reversal_error(h, ends[:, :k], ends[:, k:], speeds)
+            error[k:] = np.maximum(np.abs(error[k:]), unseen)
+        if scheme.implicit is not None:
+            weights = np.minimum(weights, system.friction_tolerance(result.end_rate[:k]))
+        if branch is not None and history is not None:
+            if deficient and h * memory.sigma_slope > UNCERTAINTY_SIGMA_CHANGE:
+                error = np.abs(error)
+                for j, *_ in deficient:
+                    if j < scheme.n_stages:
+                        uncertainty = history.uncertainty(t + scheme.c[j] * h)
+                        error[system.multiplier_part] += h * abs(scheme.b[j]) * uncertainty
+            weights = branch.widened(weights, scheme, result.sigmas, direct_from)
+        return norm(error, weights)
+
+    def _stiffness(
+        self,
+        system: System,
+        memory: IntegratorState,
+        norm: ErrorNorm,
+        result: StepResult,
+        last_motion: FloatArray | None,
+    ) -> float:
+        """Stiffness of a step, infinite where friction makes joints chatter.
+
+        ``last_motion`` (n,): tangent from the last stage to the end; None next to a singular
+        configuration, where it tells nothing.
+        """
+        scheme, h, stiffness = self.scheme, result.h, result.stiffness
+        explicit = False
+        if scheme.stable_to is not None and last_motion is not None and norm.negligible > 0.0:
+            explicit = True
+            change_of_rate = result.rates[-1] - result.rates[-2]
+            stiffness = stiffness_of(system, h, last_motion, change_of_rate)
+        if explicit or scheme.implicit is not None:
+            k = system.multiplier_part.start
+            v = np.array([memory.rate[:k], result.end_rate[:k]])
+            rubs = np.isfinite(system.friction_tolerance(result.end_rate[:k])[k:])
+            weights = norm.weights(memory.state_scale)[k:]
+            if chatters(h, v, result.rates[:, k:], weights, rubs):
+                return np.inf
+        return stiffness
 
     def accept(self, memory: IntegratorState, result: StepResult) -> None:
         """Move ``memory`` to the end of an accepted step."""

@@ -489,8 +489,9 @@ class LimitSpring(ForceElement):
     """Springs where a joint leaves its limits: tau = -(k d + c dq/dt) S(d / depth).
 
     d is how far the joint is beyond a limit (its sign that of the excess).  S rises smoothly from 0
-    to 1 over the depth, S(x) = x^3 (10 - 15 x + 6 x^2), so that the force is three times
-    differentiable at the limit and the schemes keep their order.
+    to 1 over the depth, S(x) = x^3 (10 - 15 x + 6 x^2), so that spring and damping are three
+    times and twice differentiable at the limit, and twice where S ends.  A step across either place
+    is as short as its error estimate asks, and errs by about a tolerance; others keep their order.
 
     Parameters
     ----------

@@ -103,12 +103,32 @@ def test_it_closes_with_damping_friction_and_a_controller(name: str) -> None:
     assert balance.relative < 1e-10
 
 
-@pytest.mark.parametrize("kind", srm.FORCE_TYPES)
-def test_it_closes_with_every_force_element(kind: str) -> None:
+@pytest.mark.parametrize("kind", [kind for kind in srm.FORCE_TYPES if kind != "limit_spring"])
+def test_it_closes_with_every_smooth_force_element(kind: str) -> None:
     mechanism = changed("spatial_four_bar", forces=(ELEMENTS[kind],))
     balance = srm.simulate(mechanism, 1.5, rtol=1e-10).energy_balance
     assert np.abs(balance.works["force it"]).max() > 1e-3
     assert balance.relative < 1e-10
+
+
+@pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-10, 1e-11, 1e-12])
+def test_a_limit_spring_opens_it_by_a_tolerance_at_each_end_of_its_rise_and_nowhere_else(
+    rtol: float,
+) -> None:
+    """The force is not smooth where the spring sets in and where its rise ends, so that the error
+    of a step across is the whole of what control allows; all other steps are of order 8."""
+    mechanism = changed("spatial_four_bar", forces=(ELEMENTS["limit_spring"],))
+    run = srm.simulate(mechanism, 1.5, rtol=rtol)
+    balance = run.energy_balance
+    assert np.abs(balance.works["force it"]).max() > 1e-3
+    angle = run.joint("crank")[0]
+    across = np.zeros(len(angle) - 1, dtype=bool)
+    for place in (1.2, 1.3):
+        across |= (angle[:-1] - place) * (angle[1:] - place) <= 0.0
+    assert across.sum() == 4  # in and out again, once each
+    opened = np.abs(np.diff(balance.residual)) / balance.scale
+    assert opened[across].sum() < 4 * rtol
+    assert opened[~across].sum() < 0.1 * rtol + 1e-12
 
 
 @pytest.fixture(scope="module")

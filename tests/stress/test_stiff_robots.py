@@ -18,7 +18,13 @@ from srm_mbs.analysis.time_constants import stiff_elements
 pytestmark = [pytest.mark.stress, pytest.mark.timeout(600)]
 
 ROBOTS = Path(__file__).parents[1] / "data" / "robots"
-FILES = sorted([*ROBOTS.glob("*/*.urdf"), *ROBOTS.glob("*/*.xml")])
+SINGULAR_AT_START = ("four_bar", "four_bar_branch_1_1")
+"""Change-point linkages that begin stretched out, where friction would hold them."""
+FILES = sorted(
+    path
+    for path in (*ROBOTS.glob("*/*.urdf"), *ROBOTS.glob("*/*.xml"))
+    if path.stem not in SINGULAR_AT_START
+)
 FRICTION = 2.0
 """In all joints of one coordinate (N m, N), with a friction speed of 0.01 rad/s or m/s."""
 DAMPING_FACTOR = 1e3

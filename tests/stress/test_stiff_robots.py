@@ -18,12 +18,13 @@ from srm_mbs.analysis.time_constants import stiff_elements
 pytestmark = [pytest.mark.stress, pytest.mark.timeout(600)]
 
 ROBOTS = Path(__file__).parents[1] / "data" / "robots"
-SINGULAR_AT_START = ("four_bar", "four_bar_branch_1_1")
-"""Change-point linkages that begin stretched out, where friction would hold them."""
+FOLDERS = ("dm_control", "example_robot_data", "gymnasium")
+"""Those with robots; the others have linkages and bodies without damping."""
 FILES = sorted(
     path
-    for path in (*ROBOTS.glob("*/*.urdf"), *ROBOTS.glob("*/*.xml"))
-    if path.stem not in SINGULAR_AT_START
+    for name in FOLDERS
+    for path in (ROBOTS / name).iterdir()
+    if path.suffix in (".urdf", ".xml")
 )
 FRICTION = 2.0
 """In all joints of one coordinate (N m, N), with a friction speed of 0.01 rad/s or m/s."""

@@ -18,7 +18,14 @@ from srm_mbs.analysis.time_constants import stiff_elements
 pytestmark = [pytest.mark.stress, pytest.mark.timeout(600)]
 
 ROBOTS = Path(__file__).parents[1] / "data" / "robots"
-FILES = sorted([*ROBOTS.glob("*/*.urdf"), *ROBOTS.glob("*/*.xml")])
+FOLDERS = ("dm_control", "example_robot_data", "gymnasium")
+"""Those with robots; the others have linkages and bodies without damping."""
+FILES = sorted(
+    path
+    for name in FOLDERS
+    for path in (ROBOTS / name).iterdir()
+    if path.suffix in (".urdf", ".xml")
+)
 FRICTION = 2.0
 """In all joints of one coordinate (N m, N), with a friction speed of 0.01 rad/s or m/s."""
 DAMPING_FACTOR = 1e3

@@ -60,3 +60,22 @@ def closure(mechanism: srm.Mechanism, q: FloatArray, v: FloatArray) -> FloatArra
     rows = LoopKinematics(mechanism.model, mechanism.loops)
     g, G, bias = evaluate_rows(mechanism.model, rows, q, v)
     return np.concatenate([g, G @ v, bias])
+
+
+def closure_rows(mechanism: srm.Mechanism, q: FloatArray) -> FloatArray:
+    """The Jacobian G (m, nv) of all rows at a closed configuration q."""
+    model = mechanism.model
+    rows = LoopKinematics(model, mechanism.loops)
+    g, G, _ = evaluate_rows(model, rows, q, np.zeros(model.nv))
+    np.testing.assert_allclose(g, 0.0, atol=1e-10)
+    return G
+
+
+def check_same_span(ours: FloatArray, theirs: FloatArray) -> None:
+    """The rows of both matrices span the same space."""
+    spaces = []
+    for rows in (ours, theirs):
+        _, sizes, directions = np.linalg.svd(rows)
+        basis = directions[: (sizes > 1e-7 * sizes[0]).sum()]
+        spaces.append(basis.T @ basis)
+    np.testing.assert_allclose(spaces[0], spaces[1], atol=1e-7)

@@ -13,6 +13,7 @@ import tomli_w
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.dynamics.forces import ForceKinematics
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.mjcf.reader import translate
 from srm_mbs.formats.toml.description import check_description, parse_toml
@@ -21,6 +22,7 @@ from srm_mbs.formats.urdf.parser import build_urdf
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.reach import Reach
+from tests.support.dynamics import check_same_span, closure_rows
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -62,7 +64,7 @@ class Twins:
         model, theirs, state = self.model, self.theirs, self.state
         T = np.zeros((model.nv, model.nv))
         for i in range(theirs.njnt):
-            name = mujoco.mj_id2name(theirs, mujoco.mjtObj.mjOBJ_JOINT, i)
+            name = self._joint_name(i)
             index = model.getJointId(name if model.existJointName(name) else "root_joint")
             joint = model.joints[index]
             at_q, at_v = theirs.jnt_qposadr[i], theirs.jnt_dofadr[i]
@@ -74,7 +76,7 @@ class Twins:
             elif joint.nq == 4:
                 state.qpos[at_q : at_q + 4] = mine[[3, 0, 1, 2]]
             else:
-                body = mujoco.mj_id2name(theirs, mujoco.mjtObj.mjOBJ_BODY, theirs.jnt_bodyid[i])
+                body = self._body_name(theirs.jnt_bodyid[i])
                 inside = model.frames[model.getFrameId(body, pin.FrameType.BODY)].placement
                 pose = model.jointPlacements[index] * pin.XYZQUATToSE3(mine)
                 placed = pin.SE3ToXYZQUAT(pose * inside)
@@ -90,6 +92,21 @@ class Twins:
         pin.computeJointJacobians(model, self.data, q)
         pin.updateFramePlacements(model, self.data)
         return T
+
+    def _body_name(self, body: int) -> str:
+        """As the reader names it if the file does not."""
+        name = mujoco.mj_id2name(self.theirs, mujoco.mjtObj.mjOBJ_BODY, body)
+        return name or f"body_{body}"
+
+    def _joint_name(self, joint: int) -> str:
+        """As the reader names it if the file does not."""
+        name = mujoco.mj_id2name(self.theirs, mujoco.mjtObj.mjOBJ_JOINT, joint)
+        if name:
+            return name
+        body = self.theirs.jnt_bodyid[joint]
+        number = joint - self.theirs.body_jntadr[body] + 1
+        last = number == self.theirs.body_jntnum[body]
+        return self._body_name(body) + ("" if last else f"::{number}") + "::joint"
 
     def body(self, name: str) -> tuple[pin.SE3, pin.SE3]:
         """Placement of a body, ours and theirs."""
@@ -179,28 +196,53 @@ def check_dynamics(twins: Twins, atol: float = 1e-10) -> None:
 def check_residuals(twins: Twins) -> None:
     """The residuals of the equality constraints, and the rows of couplings but for a factor, are
     those of MuJoCo."""
-    state = twins.state
     for q, v in random_states(twins):
         T = twins.put(q, v)
         expected = []
-        kind = state.efc_type[: state.nefc]
-        held = kind == mujoco.mjtConstraint.mjCNSTR_EQUALITY
-        rows = state.efc_pos[: state.nefc][held]
-        at = 0
-        jacobian = state.efc_J.reshape(state.nefc, -1)[held]
-        lengths = np.linalg.norm(jacobian, axis=1)
-        for loop in twins.entries["loop"]:
-            count = {"point": 3, "frame": 6, "coupling": 1}[loop["type"]]
-            own = rows[at : at + count]
-            at += count
-            if count == 1:
+        for loop, rows, jacobian, scale in equality_rows(twins):
+            if loop["type"] == "coupling":
                 (G,) = twins.coupling(loop)[1]
-                theirs = jacobian[at - 1] @ T / lengths[at - 1]
+                length = np.linalg.norm(jacobian)
+                theirs = jacobian[0] @ T / length
                 G *= np.sign(theirs @ G) / np.linalg.norm(G)
                 np.testing.assert_allclose(G, theirs, atol=1e-12)
-            expected.append(own[:3] if count > 1 else np.abs(own) / lengths[at - 1])
-            if count == 6:
-                expected.append(np.array([np.linalg.norm(own[3:])]))
-        assert at == rows.size
+                expected.append(np.abs(rows) / length)
+                continue
+            expected.append(rows[:3])
+            if loop["type"] == "frame":
+                expected.append(np.array([np.linalg.norm(rows[3:]) / scale]))
         for ours, other in zip(twins.residuals(), expected, strict=True):
             np.testing.assert_allclose(ours, other, atol=1e-12)
+
+
+def equality_rows(twins: Twins) -> list[tuple[dict[str, Any], FloatArray, FloatArray, float]]:
+    """Each closure with the residuals (k,) and the Jacobian (k, nv) that MuJoCo has in its place,
+    and the factor of its rows of a rotation, after :meth:`Twins.put`.
+
+    A weld whose rotation has the factor zero is a closure ``point``.
+    """
+    state, theirs = twins.state, twins.theirs
+    held = state.efc_type[: state.nefc] == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+    number = state.efc_id[: state.nefc][held]
+    rows = state.efc_pos[: state.nefc][held]
+    jacobian = state.efc_J.reshape(state.nefc, -1)[held]
+    out = []
+    loops = list(twins.entries["loop"])
+    for constraint in dict.fromkeys(number.tolist()):
+        own = number == constraint
+        weld = theirs.eq_type[constraint] == mujoco.mjtEq.mjEQ_WELD
+        scale = float(theirs.eq_data[constraint, 10]) if weld else 1.0
+        loop = loops.pop(0)
+        count = {"point": 3, "frame": 6, "coupling": 1}[loop["type"]]
+        assert own.sum() == (6 if weld else count)
+        out.append((loop, rows[own][:count], jacobian[own][:count], scale))
+    assert not loops
+    return out
+
+
+def check_row_space(twins: Twins, mechanism: Mechanism, q: FloatArray) -> None:
+    """At a closed configuration the Jacobian of the closures restrains the rates that MuJoCo's
+    equality constraints restrain."""
+    T = twins.put(q, np.zeros(mechanism.model.nv))
+    theirs = np.concatenate([jacobian @ T for _, _, jacobian, _ in equality_rows(twins)])
+    check_same_span(closure_rows(mechanism, q), theirs)

@@ -59,6 +59,11 @@ class LoopElements(ElementChecker):
         The file, and its links and joints.
     fixed_base
         Whether the ground holds the root link.
+
+    Attributes
+    ----------
+    placed
+        Placement of links inside ``<gazebo>``, which the file gives, in the root link's frame.
     """
 
     def __init__(self, file: str, graph: Graph, fixed_base: bool) -> None:
@@ -66,6 +71,7 @@ class LoopElements(ElementChecker):
         self.graph, self.fixed_base = graph, fixed_base
         self.loops: list[dict[str, Any]] = []
         self.forces: list[dict[str, Any]] = []
+        self.placed: dict[str, pin.SE3] = {}
         self._on_screws: set[str] = set()
         self._readers: dict[str, Callable[[Element, str], None]] = {
             "loop": self._loop,
@@ -351,20 +357,22 @@ class LoopElements(ElementChecker):
         if not name or name in self.graph.joints:
             raise self.fault(where, "another joint has its name", "Rename one of them")
         pitch = self._gazebo_pitch(joint, where)
-        parent, child, (axis, _), damping = self._gazebo_ends(joint, where)
+        parent, child, (axis, _), damping = self.gazebo_ends(joint, where)
         if axis is None:
             raise self.fault(where, "it has no <axis>", "Give it")
         if WORLD in (parent[0], child[0]) and WORLD not in self.graph.links:
             parent, child = self._on_root(parent, child, where)
-        ways = [(parent, child, axis), (child, parent, -axis)]
+        # The child of a screw must not carry its parent; a link that a screw holds already is
+        # taken if the other is no better.
         ways = [
             way
-            for way in ways
-            if way[1][0] not in (*self.graph.ancestors(way[0][0]), *self._on_screws)
+            for way in ((parent, child, axis), (child, parent, -axis))
+            if way[1][0] not in self.graph.ancestors(way[0][0])
         ]
         if not ways:
-            raise self.fault(where, "other screws hold both its links", "Remove one of them")
-        parent, child, axis = ways[0]
+            raise self.fault(where, "both its ends are on one link", "Remove it")
+        parent, child, axis = min(ways, key=lambda way: way[1][0] in self._on_screws)
+        shared = child[0] in self._on_screws
         self._on_screws.add(child[0])
         screw = SubElement(root, "joint", name=name, type="screw")
         SubElement(screw, "axis", xyz=numbers(axis))
@@ -373,14 +381,17 @@ class LoopElements(ElementChecker):
             SubElement(screw, "dynamics", damping=numbers([damping]))
         if is_identity(child[1]):
             _hang(screw, parent[0], child[0], parent[1])
-            self.graph.above[child[0]] = screw
+            if not shared:
+                self.graph.above[child[0]] = screw
             return name
         between = f"{name}::joint_frame"
         SubElement(root, "link", name=between)
         _hang(screw, parent[0], between, parent[1])
         fixed = SubElement(root, "joint", name=f"{name}::fixed", type="fixed")
         _hang(fixed, between, child[0], child[1].inverse())
-        self.graph.above |= {between: screw, child[0]: fixed}
+        self.graph.above[between] = screw
+        if not shared:
+            self.graph.above[child[0]] = fixed
         return f"{name}::fixed"
 
     def _on_root(self, parent: End, child: End, where: str) -> tuple[End, End]:
@@ -418,7 +429,7 @@ class LoopElements(ElementChecker):
 
     def _gazebo_joint(self, joint: Element, where: str) -> None:
         """Gazebo: the joint becomes a closure."""
-        parent, child, axes, damping = self._gazebo_ends(joint, where)
+        parent, child, axes, damping = self.gazebo_ends(joint, where)
         self.joint(
             self.kind(joint, where),
             joint.get("name", ""),
@@ -429,7 +440,7 @@ class LoopElements(ElementChecker):
             where=where,
         )
 
-    def _gazebo_ends(
+    def gazebo_ends(
         self, joint: Element, where: str
     ) -> tuple[End, End, list[FloatArray | None], float]:
         """Parent, child, axes and damping: the joint's frame is given on the child; at q = 0 that
@@ -441,7 +452,7 @@ class LoopElements(ElementChecker):
         parent, child = (self.existing(_text(parts[side]), where) for side in ("parent", "child"))
         frame = self._gazebo_pose(parts.get("pose"), child, where)
         poses = {
-            link: pin.SE3.Identity() if link == WORLD else self.graph.pose(link)
+            link: pin.SE3.Identity() if link == WORLD else self._pose(link)
             for link in (parent, child)
         }
         at = poses[child] * frame
@@ -451,6 +462,10 @@ class LoopElements(ElementChecker):
             for tag in SDF_AXES
         ]
         return (parent, poses[parent].actInv(at)), (child, frame), axes, damping
+
+    def _pose(self, link: str) -> pin.SE3:
+        """Placement of a link in the root link's frame at q = 0."""
+        return self.placed[link] if link in self.placed else self.graph.pose(link)
 
     def _gazebo_pose(self, node: Element | None, child: str, where: str) -> pin.SE3:
         """Placement of the joint's frame in the child link."""

@@ -2,7 +2,7 @@
 
 * the loop elements of other tools (:mod:`srm_mbs.formats.urdf.loop_elements`);
 * a child link with two parents: the second joint becomes a closure of its freedom, closed at the
-  joint's zero;
+  joint's zero; one whose coordinate is needed keeps it, with a share of the link;
 * ``<mimic>``: a coupling q = multiplier q_other + offset;
 * pairs of frames ``closing_<name>_1`` and ``closing_<name>_2`` of onshape-to-robot;
 * Drake's joints and motors are rewritten (:mod:`srm_mbs.formats.urdf.drake`).
@@ -19,17 +19,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 from functools import partial
 from typing import Any
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement
 
 import pinocchio as pin
 
 from srm_mbs.errors import known_names
 from srm_mbs.formats.document import Document
-from srm_mbs.formats.graph.spanning_tree_to_urdf import placement, satisfied_note
+from srm_mbs.formats.graph.spanning_tree_to_urdf import numbers, placement, satisfied_note
 from srm_mbs.formats.translation import Options, Translation
 from srm_mbs.formats.urdf.drake import rewrite
+from srm_mbs.formats.urdf.gazebo_links import hang_links, has_links
 from srm_mbs.formats.urdf.graph import ONE_DEGREE, Graph, link_of
 from srm_mbs.formats.urdf.loop_elements import LoopElements, coupling
 from srm_mbs.formats.urdf.validation import ElementChecker
@@ -37,6 +39,8 @@ from srm_mbs.formats.urdf.validation import ElementChecker
 CLOSING = re.compile(r"(closing_.+)_1\Z")
 SATISFIED = 1e-6
 """Distance (m, rad) of two frames on one body, which is rounding of the file."""
+SHARED = {"mass": ("value",), "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")}
+"""Attributes in an <inertial> of which each part of a link has its share."""
 
 
 def _named_by(own: Mapping[str, Any]) -> set[str]:
@@ -98,6 +102,10 @@ def translate(document: Document, options: Options) -> Translation:
     notes = extended.notes
     fixed_base = (options.base or options.own.get("base", "fixed")) == "fixed"
     elements = LoopElements(document.file, Graph(root), fixed_base)
+    compensated: dict[str, float] = {}
+    if has_links(root):
+        compensated = hang_links(root, elements, options.reach)
+        found = True
     held = elements.screws(root)
     found |= _cut_second_parents(root, elements, options, notes, held) or bool(held)
     elements.graph = graph = Graph(root)
@@ -118,6 +126,8 @@ def translate(document: Document, options: Options) -> Translation:
     entries: dict[str, Any] = {}
     if elements.loops:
         entries["loop"] = _named(elements.loops, options.own.get("loop", ()))
+    if compensated:
+        entries["gravity_compensation"] = compensated
     if elements.forces:
         entries["force"] = _named(elements.forces, options.own.get("force", ()))
     if found:
@@ -172,7 +182,8 @@ def _cut_second_parents(
     any.
 
     Of several joints with the same child a screw, or one of those ``held``, stays in the tree, and
-    otherwise the first.
+    otherwise the first.  Of the others those that act, or that a <mimic> refers to, get a share of
+    the link.
     """
     by_child: dict[str, list[Element]] = {}
     for joint in reader.named(root, "joint", count=False).values():
@@ -182,7 +193,8 @@ def _cut_second_parents(
     for name in options.cut:
         if name not in reader.graph.joints:
             raise reader.fault("cut", f"there is no joint {name!r}", "Name joints of the file")
-    cut = []
+    leaders = {mimic.get("joint", "") for mimic in root.iterfind("joint/mimic")}
+    cut, parted = [], []
     for child, joints in by_child.items():
         wanted = [joint for joint in joints if joint.get("name") in options.cut]
         others = [joint for joint in joints if joint not in wanted]
@@ -194,15 +206,73 @@ def _cut_second_parents(
                 f"it cannot be cut: no other joint holds the link {child!r} in the tree",
                 "Cut another joint of the loop",
             )
+        sharing = []
         for joint in joints:
-            if joint is not kept:
+            name = joint.get("name", "")
+            if joint is kept:
+                continue
+            if name in leaders or name in held or _acts(joint, reader):
+                sharing.append(joint)
+            else:
                 _close(joint, reader)
                 root.remove(joint)
-                cut.append(joint.get("name", ""))
+                cut.append(name)
+        if sharing:
+            _share(root, child, sharing, reader)
+            parted += [joint.get("name", "") for joint in sharing]
     if cut:
         names = ", ".join(map(repr, cut))
         notes.append(f"the joints {names} close loops: they are cut and became closures")
-    return bool(cut)
+    if parted:
+        names = ", ".join(map(repr, parted))
+        notes.append(
+            f"the joints {names} close loops and their coordinates are needed: each moves a link "
+            "<child>::<joint> with a share of the mass and inertia of its child, which a closure "
+            "holds to the child"
+        )
+    return bool(cut or parted)
+
+
+def _acts(joint: Element, reader: LoopElements) -> bool:
+    """Whether a joint that closes a loop has a thread, a <mimic>, friction or armature, which no
+    closure has."""
+    dynamics = joint.find("dynamics")
+    where = f"joint {joint.get('name', '')!r}, which closes a loop"
+    return (
+        joint.get("type") == "screw"
+        or joint.find("mimic") is not None
+        or any(reader.number_or(0.0, dynamics, key, where) for key in ("friction", "armature"))
+    )
+
+
+def _share(root: Element, child: str, joints: Sequence[Element], reader: LoopElements) -> None:
+    """Hang on each of ``joints`` an equal share of the link ``child``, which stays the child of
+    another joint, and hold them together by closures.
+
+    The parts have one frame: the motion is that of the whole link.
+    """
+    links = reader.named(root, "link", count=False)
+    if child not in links:
+        where = f"joint {joints[0].get('name', '')!r}"
+        raise reader.unknown(where, f"the link {child!r} does not exist", links)
+    inertial = links[child].find("inertial")
+    if inertial is not None:
+        for node in inertial:
+            for key in SHARED.get(node.tag, ()):
+                value = reader.number_or(0.0, node, key, f"link {child!r}, <inertial>")
+                node.set(key, numbers([value / (1 + len(joints))]))
+    for joint in joints:
+        name = joint.get("name", "")
+        part = f"{child}::{name}"
+        if part in links:
+            raise reader.fault(f"link {part!r}", "a part of a link gets this name", "Rename it")
+        own = SubElement(root, "link", name=part)
+        if inertial is not None:
+            own.append(deepcopy(inertial))
+        for node in joint.findall("child"):
+            node.set("link", part)
+        ends = (part, pin.SE3.Identity()), (child, pin.SE3.Identity())
+        reader.add("fixed", part, *ends, where=f"joint {name!r}")
 
 
 def _close(joint: Element, reader: LoopElements) -> None:
@@ -210,25 +280,13 @@ def _close(joint: Element, reader: LoopElements) -> None:
     name = joint.get("name", "")
     where = f"joint {name!r}, which closes a loop"
     kind = reader.kind(joint, where)
-    if joint.find("mimic") is not None:
-        raise reader.fault(where, "it has a <mimic>", "Cut the loop at another joint")
     reader.attributes(joint, where)
     reader.children(joint, where)
     limit = joint.find("limit")
     if limit is not None:
         for key in limit.attrib:
             reader.number(limit, key, where)
-    damping, friction, armature = (
-        reader.number_or(0.0, joint.find("dynamics"), key, where)
-        for key in ("damping", "friction", "armature")
-    )
-    for value, what in ((friction, "friction"), (armature, "armature")):
-        if value:
-            raise reader.fault(
-                where,
-                f"its {what} ({value:g}) would not act: a closure has none",
-                f'Cut the loop at another joint (cut = ["..."]), or set the {what} to 0',
-            )
+    damping = reader.number_or(0.0, joint.find("dynamics"), "damping", where)
     if kind == "floating":  # it restrains nothing
         return
     parent, child = (reader.existing(link_of(joint, side), where) for side in ("parent", "child"))

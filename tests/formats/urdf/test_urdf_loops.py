@@ -184,13 +184,13 @@ def test_the_cross_of_a_universal_closure_has_an_axis_on_either_side(tmp_path: P
 
 # --- a child of two parents, and joints inside <gazebo> ----------------------------------------
 
-SECOND = """<joint name="second" type="{kind}"><parent link="shin"/><child link="rim"/>
+SECOND = """<joint name="{name}" type="{kind}"><parent link="shin"/><child link="rim"/>
   <origin {origin}/>{axis}{more}</joint>"""
 
 
-def second(kind: str, more: str = "") -> str:
+def second(kind: str, more: str = "", name: str = "second") -> str:
     axis = "" if kind == "fixed" else DIRECTION
-    return SECOND.format(kind=kind, origin=SHIN, axis=axis, more=more)
+    return SECOND.format(name=name, kind=kind, origin=SHIN, axis=axis, more=more)
 
 
 @pytest.mark.parametrize(
@@ -375,6 +375,31 @@ def test_two_screws_of_gazebo_on_one_link_hold_one_link_each(tmp_path: Path) -> 
     np.testing.assert_allclose(places[0], places[1], atol=1e-9)
 
 
+def test_a_third_screw_between_two_links_that_screws_hold_gets_a_share_of_one(
+    tmp_path: Path,
+) -> None:
+    """Here it repeats another one, and changes nothing."""
+    links = "".join(NUT_LINK.format(name) for name in ("base", "slide", "wheel", "second"))
+    other = (
+        '<joint name="other" type="prismatic"><parent link="base"/><child link="second"/>'
+        '<origin xyz="0.1 0.5 0"/><axis xyz="0 1 0"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+    )
+    threads = THREAD.format("base", "wheel", "", "<thread_pitch>50</thread_pitch>")
+    left = THREAD.format("second", "wheel", "{}", "<thread_pitch>-50</thread_pitch>")
+    threads += left.format("").replace('"thread"', '"left"')
+    ends = []
+    for pose in (None, "", "<pose>0 0.1 0 0 0 0</pose>"):
+        more = "" if pose is None else left.format(pose).replace('"thread"', '"again"')
+        path = write(tmp_path, NUT.format(links=links, thread=other + threads + more))
+        mechanism = srm.load(path, gravity=(0.0, 9.0, 0.0))
+        assert mechanism.degrees_of_freedom == 1
+        assert len(mechanism.loops) == (2 if pose is None else 3)
+        ends.append(end_of(mechanism, "second", srm.simulate(mechanism, 1.0, rtol=1e-10).q[-1]))
+    assert abs(ends[0][1] - 0.5) > 1e-3
+    np.testing.assert_allclose(ends[1:], [ends[0]] * 2, atol=1e-9)
+
+
 def test_a_screw_of_gazebo_on_the_ground_needs_a_base_that_the_ground_holds(tmp_path: Path) -> None:
     links = "".join(NUT_LINK.format(name) for name in ("base", "slide", "wheel"))
     thread = THREAD.format("world", "wheel", "", "<thread_pitch>50</thread_pitch>")
@@ -516,6 +541,96 @@ def test_the_motion_does_not_depend_on_where_the_loop_is_cut(tmp_path: Path) -> 
         assert solution.energy[-1] - solution.energy[0] < -0.05
     assert abs(ends[0][0] - 0.5) > 0.01
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("on_guide", "wheel"),
+    [
+        ('<dynamics damping="0.6" friction="0.9"/>', ""),
+        ('<dynamics armature="0.7"/>', ""),
+        ("", '<mimic joint="guide" multiplier="3" offset="0.2"/>'),
+    ],
+)
+def test_a_joint_whose_coordinate_is_needed_is_cut_with_a_share_of_its_link(
+    on_guide: str, wheel: str, tmp_path: Path
+) -> None:
+    """The motion and its energy are those with the loop cut at another joint."""
+    urdf = slider_crank(on_guide=on_guide)
+    if wheel:
+        wheel = HINGE.format(name="turn", parent="ground", child="wheel", xyz="0 0 2", more=wheel)
+        urdf = urdf.replace("</robot>", f"{BAR.format(name='wheel', half=0.1)}{wheel}</robot>")
+    runs = []
+    for cut, name in (("", "slider::guide"), ('cut = ["pin"]\n', "pin")):
+        guess = "b = -1.6, guide = 1.1" + ", turn = 3.4" * bool(wheel)
+        start = START.replace("b = -1.6", guess)
+        mechanism = srm.load(described(tmp_path, urdf, cut + start))
+        assert mechanism.loops[0].name == name
+        assert mechanism.degrees_of_freedom == 1
+        runs.append(srm.simulate(mechanism, 1.0, rtol=1e-10))
+    assert any(
+        "'guide' close loops and their coordinates are needed" in note
+        for note in runs[0].mechanism.notes
+    )
+    for joint in ("a", "b", "guide"):
+        here, there = (float(run.joint(joint)[0][-1]) for run in runs)
+        assert here == pytest.approx(there, abs=1e-7)
+    for link in ("slider", "wheel") if wheel else ("slider",):
+        ends = [end_of(run.mechanism, link, run.q[-1]) for run in runs]
+        np.testing.assert_allclose(ends[0], ends[1], atol=1e-7)
+    lost = [run.energy[-1] - run.energy[0] for run in runs]
+    assert lost[0] == pytest.approx(lost[1], abs=1e-7)
+    assert runs[0].energy[0] == pytest.approx(runs[1].energy[0], rel=1e-9)
+
+
+@pytest.mark.parametrize("order", [("crank", "bar"), ("bar", "crank")])
+def test_a_link_inside_gazebo_hangs_on_the_first_joint_that_holds_it(
+    order: tuple[str, str], tmp_path: Path
+) -> None:
+    """A parallelogram whose coupler is inside <gazebo>, without weight, and the same in URDF."""
+    bars = "".join(BAR.format(name=name, half=0.25) for name in ("crank", "rocker"))
+    hinges = "".join(
+        HINGE.format(name=f"on_{child}", parent="ground", child=child, xyz=f"{x} 0 1", more="")
+        for child, x in (("crank", 0.0), ("rocker", 1.0))
+    )
+    frame = f'<robot name="bars"><link name="ground"/>{bars}{hinges}{{}}</robot>'
+    joint = (
+        '<joint name="{}" type="revolute"><parent>{}</parent><child>{}</child><pose>{}</pose>'
+        "<axis><xyz>0 -1 0</xyz><dynamics><damping>0.2</damping></dynamics></axis></joint>"
+    )
+    first = "0.5 0 0 0 0 0" if order[1] == "crank" else "0 0 0 0 0 0"
+    inside = (
+        '<gazebo><link name="bar"><pose>0.5 0 1 0 0 0</pose><gravity>0</gravity><inertial>'
+        "<mass>2</mass><inertia><ixx>0.1</ixx><iyy>0.2</iyy><izz>0.2</izz></inertia>"
+        "<pose>0.4 0 0 0 0 0</pose></inertial></link></gazebo>"
+        f"<gazebo>{joint.format('near', *order, first)}"
+        f"{joint.format('far', 'bar', 'rocker', '0.5 0 0 0 0 0')}</gazebo>"
+    )
+    link = (
+        '<link name="bar"><inertial><origin xyz="0.4 0 0"/><mass value="2"/>'
+        '<inertia ixx="0.1" iyy="0.2" izz="0.2" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    )
+    damped = '<dynamics damping="0.2"/>'
+    near = HINGE.format(name="near", parent="crank", child="bar", xyz="0.5 0 0", more=damped)
+    far = HINGE.format(name="far", parent="bar", child="tip", xyz="1 0 0", more=damped)
+    tip = (
+        '<link name="tip"/><joint name="held" type="fixed"><parent link="rocker"/>'
+        '<child link="tip"/><origin xyz="0.5 0 0"/></joint>'
+    )
+    runs = []
+    start = "[initial]\nv = { on_crank = 1.0 }\n"
+    for urdf, more in (
+        (frame.format(inside), ""),
+        (frame.format(link + near + tip + far), "gravity_compensation = { bar = 1.0 }\n"),
+    ):
+        mechanism = srm.load(described(tmp_path, urdf, more + start))
+        assert names_and_types(mechanism) == [("far", "revolute")]
+        assert mechanism.model.getFrameId("bar") < mechanism.model.nframes
+        runs.append(srm.simulate(mechanism, 0.6, rtol=1e-10))
+    ends = [end_of(run.mechanism, "bar", run.q[-1]) for run in runs]
+    assert abs(ends[0][0] - 0.5) > 0.01
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-7)
+    energies = [run.energy[-1] - run.energy[0] for run in runs]
+    assert energies[0] == pytest.approx(energies[1], abs=1e-7)
 
 
 def test_the_caller_may_choose_the_cut(tmp_path: Path) -> None:
@@ -681,12 +796,22 @@ FAULTS = {
     .replace("<child>rim", "<child>base"),
     "gazebo screw of a name that is taken": gazebo("screw", "").replace('"ring"', '"hip"'),
     "gazebo joint with more": gazebo("ball", "<plugin/>"),
-    "second joint with friction": second("revolute", '<dynamics friction="2"/>'),
-    "second joint with armature": second("revolute", '<dynamics armature="2"/>'),
     "second joint with damping": second("spherical", '<dynamics damping="2"/>'),
-    "second joint, two of them screws": second("screw", '<thread_pitch value="1"/>')
-    + second("screw", '<thread_pitch value="1"/>').replace('"second"', '"third"'),
-    "second joint that mimics": second("revolute", '<mimic joint="hip"/>'),
+    "second joint with a friction that is no number": second(
+        "revolute", '<dynamics friction="much"/>'
+    ),
+    "second joint with friction, of no link": (
+        second("revolute") + second("revolute", '<dynamics friction="2"/>', "third")
+    ).replace('"rim"', '"brim"'),
+    "gazebo link without name": "<gazebo><link/></gazebo>",
+    "gazebo link of a name that is taken": "<gazebo><link name='rim'/></gazebo>",
+    "gazebo link that nothing holds": "<gazebo><link name='bar'/></gazebo>",
+    "gazebo link relative to another": (
+        "<gazebo><link name='bar'><pose relative_to='rim'>0 0 0 0 0 0</pose></link></gazebo>"
+    ),
+    "gazebo link with more": "<gazebo><link name='bar'><spin/></link></gazebo>",
+    "gazebo link on a hinge without axis": "<gazebo><link name='bar'/>"
+    + gazebo("revolute", "").replace("<gazebo>", "").replace(">rim<", ">bar<"),
     "second joint with more": second("revolute", "<play/>"),
 }
 

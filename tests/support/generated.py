@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import math
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +14,7 @@ import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.integration.generated.code_cache import compile_and_load
+from srm_mbs.integration.generated.expressions import Expression, live_nodes
 from srm_mbs.integration.generated.structure import structure_of
 from srm_mbs.integration.generated.terms import source_of
 
@@ -57,3 +61,32 @@ class GeneratedFunction:
         status = self.library.srm_mbs_terms(*arrays, None, *out, entries, None, None)
         upper = M.T  # written column by column
         return Terms(upper + np.triu(upper, 1).T, nle, tau, g, bias, G, status)
+
+
+_OPERATIONS: dict[str, Callable[..., float]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "negate": operator.neg,
+    "sqrt": math.sqrt,
+    "sin": math.sin,
+    "cos": math.cos,
+    "fabs": abs,
+    "fmax": max,
+    "fmin": min,
+    "copysign": math.copysign,
+    "choose": lambda condition, a, b: a if condition != 0.0 else b,
+}
+
+
+def values_of(expressions: Sequence[Expression], leaves: Mapping[Expression, float]) -> list[float]:
+    """Numbers of ``expressions``, computed node by node in Python."""
+    found = {leaf.number: value for leaf, value in leaves.items()}
+    for node in live_nodes(expressions):
+        if node.operation == "constant":
+            found[node.number] = node.value
+        elif node.operands:
+            operands = [found[operand.number] for operand in node.operands]
+            found[node.number] = _OPERATIONS[node.operation](*operands)
+    return [found[expression.number] for expression in expressions]

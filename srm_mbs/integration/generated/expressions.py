@@ -246,7 +246,7 @@ class Written(NamedTuple):
 _INFIX = frozenset("+-*/")
 
 
-def _live(roots: Iterable[Expression], done: set[int] | None = None) -> list[Expression]:
+def live_nodes(roots: Iterable[Expression], done: set[int] | None = None) -> list[Expression]:
     """The nodes that ``roots`` need, each after its operands, but those ``done``, which grow."""
     done = set() if done is None else done
     out: list[Expression] = []
@@ -300,7 +300,7 @@ class _Names:
 def write_c(outputs: Sequence[Output], guards: Sequence[Guard] = ()) -> Written:
     """``outputs`` as C, in static single assignment, where all ``guards`` hold."""
     roots = [node for guard in guards for node in guard] + [out.value for out in outputs]
-    live = _live(roots)
+    live = live_nodes(roots)
     read = [o for node in live if node.depends == VARIABLE for o in node.operands] + roots
     # Parameters and what depends on them alone, as far as the terms read it, in their order.
     places: dict[int, int] = {}
@@ -324,7 +324,7 @@ def write_c(outputs: Sequence[Output], guards: Sequence[Guard] = ()) -> Written:
 
     def evaluate(root: Expression) -> str:
         nonlocal count
-        for node in _live((root,), done):
+        for node in live_nodes((root,), done):
             if node.depends == VARIABLE and node.operands:
                 terms.append(f"  const double x{node.number} = {names.operation(node)};")
                 names.give(node, f"x{node.number}")

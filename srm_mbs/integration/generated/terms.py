@@ -23,6 +23,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from srm_mbs.integration.generated.algebra import algebra_of
+from srm_mbs.integration.generated.differentiation import Direction
 from srm_mbs.integration.generated.expressions import (
     PARAMETER,
     Expression,
@@ -239,6 +240,48 @@ class _Trace:
         """The body of a joint of the model."""
         number = self.structure.bodies[joint]
         return self.ground if number < 0 else self.bodies[number]
+
+    def directions(self) -> tuple[list[Direction], list[Direction]]:
+        """Rates of change of q and v along each of their tangent coordinates.
+
+        Those of q are body velocities: q moves as by ``pinocchio.integrate``, which is the chart
+        of a step at its start (:mod:`srm_mbs.dynamics.manifold`).
+        """
+        one = self.recorder.one
+        positions: list[Direction] = []
+        for motion in self.structure.motions:
+            positions += self._moves(motion)
+        return positions, [{rate: one} for rate in self.v]
+
+    def _moves(self, motion: Motion) -> list[Direction]:
+        """The directions of q that the rates of a motion have."""
+        q, first, kind, one = self.q, motion.in_q, motion.kind, self.recorder.one
+        if kind == "unbounded":
+            return [self._turns_pair(first)]
+        if kind == "planar":
+            c, s = q[first + 2], q[first + 3]
+            along: list[Direction] = [{q[first]: c, q[first + 1]: s}]
+            return [*along, {q[first]: -s, q[first + 1]: c}, self._turns_pair(first + 2)]
+        if kind == "spherical":
+            return self._turns_quaternion(first)
+        if kind == "free":
+            axes = _transposed(self._of_quaternion(first + 3))
+            shifts: list[Direction] = [dict(zip(q[first : first + 3], axis)) for axis in axes]
+            return [*shifts, *self._turns_quaternion(first + 3)]
+        count = 3 if kind == "translation" else 1
+        return [{q[first + i]: one} for i in range(count)]
+
+    def _turns_pair(self, first: int) -> Direction:
+        """That of a cosine and a sine."""
+        c, s = self.q[first], self.q[first + 1]
+        return {c: -s, s: c}
+
+    def _turns_quaternion(self, first: int) -> list[Direction]:
+        """Those of a unit quaternion, by the spins about the axes of the body."""
+        x, y, z, w = (0.5 * entry for entry in self.q[first : first + 4])
+        own = self.q[first : first + 4]
+        rates = (w, z, -y, -x), (-z, w, x, -y), (y, -x, w, -z)
+        return [dict(zip(own, rate)) for rate in rates]
 
     # -- joints
 
@@ -652,6 +695,55 @@ FORCE_KINDS = (
 """As forces.hpp numbers them."""
 
 
+class RecordedTerms(NamedTuple):
+    """The terms of a structure as expressions.
+
+    Attributes
+    ----------
+    parameters
+        Leaves that C reads as p[0], p[1], ..., and constants in the places of 0, 1 and -1.
+    q, v
+        The leaves of the state.
+    outputs
+        Places in C, as ``M[3]``, and what they are: M, nle, g, bias, G, tau, B, J.
+    guards
+        Distances of points that must not coincide.
+    along_q, along_v
+        The directions of the tangent coordinates (nv each): body velocities.
+    """
+
+    parameters: list[Expression]
+    q: list[Expression]
+    v: list[Expression]
+    outputs: list[Output]
+    guards: list[Guard]
+    along_q: list[Direction]
+    along_v: list[Direction]
+
+
+def record_terms(structure: Structure) -> RecordedTerms:
+    """The terms of ``structure``, recorded.
+
+    Raises
+    ------
+    UnsupportedElementError
+        If two points of an element coincide in every configuration.
+    """
+    trace = _Trace(structure)
+    try:
+        trace.tree()
+        trace.rows()
+        trace.forces()
+        trace.bushing_bodies()
+    except ZeroDivisionError as error:
+        why = "the two points of an element coincide in every configuration"
+        raise UnsupportedElementError(why) from error
+    directions = trace.directions()
+    return RecordedTerms(
+        trace.parameters, trace.q, trace.v, trace.outputs, trace.guards, *directions
+    )
+
+
 class Source(NamedTuple):
     """The C of a structure, and the number of its statements."""
 
@@ -671,16 +763,8 @@ def source_of(structure: Structure) -> Source:
     UnsupportedElementError
         If two points of an element coincide in every configuration.
     """
-    trace = _Trace(structure)
-    try:
-        trace.tree()
-        trace.rows()
-        trace.forces()
-        trace.bushing_bodies()
-    except ZeroDivisionError as error:
-        why = "the two points of an element coincide in every configuration"
-        raise UnsupportedElementError(why) from error
-    written = write_c(trace.outputs, trace.guards)
+    recorded = record_terms(structure)
+    written = write_c(recorded.outputs, recorded.guards)
     laws = sum(force.laws.length for force in structure.forces)
     sizes = (
         *(ABI, structure.nq, structure.nv, structure.rows, structure.rank),

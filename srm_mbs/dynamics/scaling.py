@@ -27,7 +27,7 @@ RELATIVE_ROUNDING = 1e-12
 this part of the distance from the origin, or of the largest radius of gyration."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Units:
     """Characteristic sizes of a mechanism.
 
@@ -57,6 +57,10 @@ def row_angles(mechanism: MechanismData) -> BoolArray:
     Joint rows are in the unit of their first joint.
     """
     return _angles(mechanism.model, mechanism.loops)
+
+
+KEPT_UNITS = 64
+"""Configurations whose units a mechanism keeps at most."""
 
 
 def constraint_angles(mechanism: MechanismData) -> BoolArray:
@@ -129,9 +133,22 @@ def row_units(mechanism: MechanismData, units: Units) -> FloatArray:
 
 
 def constraint_units(mechanism: MechanismData, units: Units) -> FloatArray:
-    """Units of all rows (rows,), those of the drives after those of the loops."""
-    closures = [*mechanism.loops, *driven_closures(mechanism.drives)]
-    return _units_of(closures, mechanism.model, units)
+    """Units of all rows (rows,), those of the drives after those of the loops; read-only."""
+    known = _known_row_units(mechanism)
+    if units not in known:
+        closures = [*mechanism.loops, *driven_closures(mechanism.drives)]
+        found = _units_of(closures, mechanism.model, units)
+        found.setflags(write=False)
+        if len(known) >= KEPT_UNITS:
+            known.clear()
+        known[units] = found
+    return known[units]
+
+
+@per_model
+def _known_row_units(mechanism: MechanismData) -> dict[Units, FloatArray]:
+    """Units of all rows, by the units that they follow from."""
+    return {}
 
 
 def _units_of(closures: Sequence[LoopClosure], model: pin.Model, units: Units) -> FloatArray:
@@ -146,8 +163,26 @@ def _units_of(closures: Sequence[LoopClosure], model: pin.Model, units: Units) -
     return np.array(out)
 
 
+@per_model
+def _known_units(mechanism: MechanismData) -> dict[tuple[bytes, bytes], Units]:
+    """Units with gravity, which do not depend on v, by gravity and q."""
+    return {}
+
+
 def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> Units:
     """Units of ``mechanism`` at the configuration q (nq,) and velocity v (nv,)."""
+    gravity = mechanism.model.gravity.linear
+    if not gravity.any():
+        return _units_at(mechanism, q, v)
+    known, key = _known_units(mechanism), (gravity.tobytes(), q.tobytes())
+    if key not in known:
+        if len(known) >= KEPT_UNITS:
+            known.clear()
+        known[key] = _units_at(mechanism, q, v)
+    return known[key]
+
+
+def _units_at(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> Units:
     model = mechanism.model
     data = workspace(model)
     pin.computeJointJacobians(model, data, q)

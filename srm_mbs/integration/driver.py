@@ -210,6 +210,10 @@ class RunRecord:
             return self.steps[-1].state
         return self.x0 if self.rest is None else self.rest[1]
 
+    def close(self) -> None:
+        """Let go of the steps, which arrays have, and of what made them."""
+        self.steps, self.times = [], []
+
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
         t0, x0 = (self.t0, self.x0) if self.rest is None else self.rest

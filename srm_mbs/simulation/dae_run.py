@@ -162,7 +162,13 @@ def run_dae(
         events=None if watch is None else watch.found(),
         status=record.status,
         message=record.message + method_messages(method, record.steps, norm),
-        stats=statistics(system, record, data.count, len(data.zones), wrappers),
+        stats=statistics(
+            record,
+            data.count,
+            len(data.zones),
+            wrappers,
+            (system.evaluations, system.factorisations),
+        ),
     )
     result.error = record.error
     log_end("DAE", result)

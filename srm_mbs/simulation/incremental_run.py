@@ -37,6 +37,8 @@ from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.result import Statistics
 from srm_mbs.simulation.runner import placed_control
 
+FINISHED = int(ReturnReason.FINISHED)
+
 
 @dataclass(eq=False, repr=False)
 class IncrementalRun(ABC):
@@ -156,8 +158,8 @@ class IncrementalRun(ABC):
 
     @property
     @abstractmethod
-    def steps(self) -> int:
-        """Number of inner steps."""
+    def last_steps(self) -> int:
+        """Number of inner steps of the last :meth:`go_on`."""
 
     @abstractmethod
     def _counts(self) -> tuple[int, int, int, int, int]:
@@ -194,16 +196,17 @@ class KernelRun(IncrementalRun):
             placed=options.placement,
             singular_tolerance=None if self._passages() is None else options.singular_tolerance,
         )
-        self._go_on = self._run.go_on
+        # Looked up once: steps of control loops take a few microseconds.
+        self._core = self._run.core
+        self._go_on = self._core.go_on
 
     @property
     def t(self) -> float:
-        return float(self._run.t)
+        return self._core.t  # type: ignore[no-any-return]
 
     @property
     def state(self) -> FloatArray:
-        state: FloatArray = self._run.state
-        return state
+        return self._core.state  # type: ignore[no-any-return]
 
     def _hold(self, t: float, force: FloatArray) -> None:
         super()._hold(t, force)
@@ -221,11 +224,16 @@ class KernelRun(IncrementalRun):
         forces_jumped: bool,
         grid: float,
     ) -> None:
-        run = self._run
-        returned = self._go_on(end, first, last, force, forces_jumped, grid, CHUNK)
-        self.held.only(force)  # clones need it, too
-        if returned == ReturnReason.FINISHED:
+        # The kernel holds the force of the last call; arrays are not changed in place.
+        same = force is self.held.values[0]
+        returned = self._go_on(
+            end, first, last, None if same else force, forces_jumped, grid, CHUNK
+        )
+        if not same:
+            self.held.only(force)  # clones need it, too
+        if returned == FINISHED:
             return
+        run = self._run
         self.system.between(first, last)
         reason = ReturnReason(returned)
         if reason is ReturnReason.BREAKPOINT:
@@ -243,8 +251,8 @@ class KernelRun(IncrementalRun):
         self._run.restore(snapshot)
 
     @property
-    def steps(self) -> int:
-        return int(self._run.totals()[0])
+    def last_steps(self) -> int:
+        return self._core.count  # type: ignore[no-any-return]
 
     def _counts(self) -> tuple[int, int, int, int, int]:
         steps, rejected, zones = self._run.totals()
@@ -261,7 +269,7 @@ class ReferenceRun(IncrementalRun):
     _nearness: SingularProximity
     _examined: CriticalPassages | None
     _wrappers: Sequence[ControlWrapper] = ()
-    _steps = _rejected = _zone_steps = 0
+    _steps = _last_steps = _rejected = _zone_steps = 0
     _placed = _replaced = 0
     """Counts of former wrappers."""
 
@@ -318,7 +326,8 @@ class ReferenceRun(IncrementalRun):
             self._t, self._state = record.times[-1], record.steps[-1].state
         if record.memory is not None:
             self._memory = record.memory
-        self._steps += len(record.times)
+        self._last_steps = len(record.times)
+        self._steps += self._last_steps
         self._rejected += sum(a.decision is StepDecision.REJECTED for a in record.attempts)
         self._zone_steps += sum(step.zone is not None for step in record.steps)
         if record.status is RunStatus.INTERRUPTED:
@@ -340,8 +349,8 @@ class ReferenceRun(IncrementalRun):
         self._placed, self._replaced = -placed, -replaced
 
     @property
-    def steps(self) -> int:
-        return self._steps
+    def last_steps(self) -> int:
+        return self._last_steps
 
     def _counts(self) -> tuple[int, int, int, int, int]:
         placed = self._placed + sum(wrapper.placed for wrapper in self._wrappers)

@@ -51,6 +51,8 @@ def log_end(name: str, solution: RunOutcome) -> None:
 
     After Ctrl-C there is no search, so that the solution comes at once.
     """
+    if not log.isEnabledFor(logging.INFO):
+        return
     stats = solution.stats
     log.info(
         "%s: %s after %d steps (%d rejected, %d redone at singular configurations) and "

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,6 +161,58 @@ class RunOutcome:
         return np.column_stack([chosen["t"], chosen["h"]])
 
 
+class RunData(Protocol):
+    """The data of a run of a mechanism, computed when they are first read.
+
+    Attributes
+    ----------
+    steps, dense
+        The accepted steps and their dense output; None of a run with output times that did not
+        keep them.
+    output, again
+        Of such a run, its output, and a function that makes it again; None otherwise, and if it
+        cannot be made again.
+    bifurcations
+        As in :class:`SimulationResult`; None where they have not been looked for.
+    attempts, message, stats, settings
+        As in :class:`SimulationResult`.
+    """
+
+    @property
+    def steps(self) -> StepData | None: ...
+    @property
+    def dense(self) -> DenseOutput | None: ...
+    @property
+    def output(self) -> StreamedOutput | None: ...
+    @property
+    def again(self) -> Callable[[], SimulationResult] | None: ...
+    @property
+    def bifurcations(self) -> tuple[Bifurcation, ...] | None: ...
+    @property
+    def attempts(self) -> NDArray[np.void]: ...
+    @property
+    def message(self) -> str: ...
+    @property
+    def stats(self) -> Statistics: ...
+    @property
+    def settings(self) -> Settings: ...
+
+
+@dataclass(frozen=True, eq=False)
+class KnownRunData:
+    """:class:`RunData` that have been computed: of runs from files and other processes."""
+
+    steps: StepData | None
+    dense: DenseOutput | None
+    attempts: NDArray[np.void]
+    message: str
+    stats: Statistics
+    settings: Settings
+    output: StreamedOutput | None = None
+    again: Callable[[], SimulationResult] | None = None
+    bifurcations: tuple[Bifurcation, ...] | None = None
+
+
 class SimulationResult(RunOutcome):
     """Result of a run of a mechanism; :class:`srm_mbs.Solution` adds pictures and files.
 
@@ -195,51 +247,67 @@ class SimulationResult(RunOutcome):
         mechanism: Mechanism,
         system: OpenSystem | ClosedSystem,
         scheme: ButcherTableau,
-        steps: StepData | None,
+        run: RunData,
         *,
-        dense: DenseOutput | None = None,
-        output: StreamedOutput | None = None,
-        again: Callable[[], SimulationResult] | None = None,
         t_eval: FloatArray | None,
-        attempts: NDArray[np.void],
         events: tuple[list[FloatArray], list[FloatArray]] | None = None,
         status: str,
-        message: str,
-        stats: Statistics,
-        settings: Settings,
     ) -> None:
         self.mechanism = mechanism
-        self._steps = steps
-        self._output, self._again = output, again
+        self._run = run
         self.scheme = scheme
-        self.attempts = attempts
         self.status = RunStatus(status)
-        self.message = message
-        self.stats = stats
-        self.settings = settings
         self._system = system
-        if steps is not None:
-            dense = DenseOutput(system, scheme, steps) if dense is None else dense
-            # q and v are views: writing to them would change the dense output.
-            steps.states.setflags(write=False)
-            steps.times.setflags(write=False)
-        self._dense_output = dense
         self.t_eval = t_eval
-        if output is not None:
-            self.t, states = output.t, output.states
-        elif t_eval is None:
-            self.t, states = self._dense.nodes()
-            states.setflags(write=False)
-            self.t.setflags(write=False)
-        else:
-            self.t = t_eval[t_eval <= self.steps.end]
-            states = self._dense(self.t)
-        nq = mechanism.model.nq
-        self.q, self.v = states[:, :nq], states[:, nq:]
+        if t_eval is not None:
+            _ = self._nodes  # what cannot be evaluated is an error here
         self.t_events: list[FloatArray] | None = None
         self.q_events: list[FloatArray] | None = None
         self.v_events: list[FloatArray] | None = None
         self._take_events(events)
+
+    @cached_property
+    def attempts(self) -> NDArray[np.void]:  # type: ignore[override]
+        return self._run.attempts
+
+    @cached_property
+    def message(self) -> str:  # type: ignore[override]
+        return self._run.message
+
+    @cached_property
+    def stats(self) -> Statistics:  # type: ignore[override]
+        return self._run.stats
+
+    @cached_property
+    def settings(self) -> Settings:  # type: ignore[override]
+        return self._run.settings
+
+    @cached_property
+    def _nodes(self) -> tuple[FloatArray, FloatArray]:
+        """Times (n,) s, and states (n, nx) there."""
+        output = self._run.output
+        if output is not None:
+            return output.t, output.states
+        if self.t_eval is not None:
+            t = self.t_eval[self.t_eval <= self.steps.end]
+            return t, self._dense(t)
+        t, states = self._dense.nodes()
+        # q and v are views: writing to them would change the dense output.
+        states.setflags(write=False)
+        t.setflags(write=False)
+        return t, states
+
+    @cached_property
+    def t(self) -> FloatArray:
+        return self._nodes[0]
+
+    @cached_property
+    def q(self) -> FloatArray:
+        return self._nodes[1][:, : self.mechanism.model.nq]
+
+    @cached_property
+    def v(self) -> FloatArray:
+        return self._nodes[1][:, self.mechanism.model.nq :]
 
     def _take_events(self, events: tuple[list[FloatArray], list[FloatArray]] | None) -> None:
         """Times and states of the occurrences of each event."""
@@ -274,31 +342,32 @@ class SimulationResult(RunOutcome):
         InputError
             If that run called Python functions, which are not called again.
         """
-        if self._steps is None:
-            self._make_again()
-        return self._steps  # type: ignore[return-value]
+        return self._whole.steps  # type: ignore[return-value]
 
     @property
     def _dense(self) -> DenseOutput:
-        if self._dense_output is None:
-            self._make_again()
-        return self._dense_output  # type: ignore[return-value]
+        return self._whole.dense  # type: ignore[return-value]
 
-    def _make_again(self) -> None:
-        if self._again is None:
+    @cached_property
+    def _whole(self) -> RunData:
+        """The run with its steps, made again if it did not keep them."""
+        run = self._run
+        if run.output is None:
+            return run
+        if run.again is None:
             raise InputError(
                 f"the run has output times and {self.stats.steps} steps, which are more than it "
                 "keeps, and called Python functions, so that it is not made again",
                 element="t_eval",
                 remedy="Run it without t_eval, and read solution.at(times)",
             )
-        whole = self._again()
-        self._steps, self._dense_output = whole.steps, whole._dense
+        return run.again()._run
 
     @property
     def span(self) -> tuple[float, float]:
         """Start and end (s) of the run, whatever ``t`` holds."""
-        return super().span if self._output is None else self._output.span
+        output = self._run.output
+        return super().span if output is None else output.span
 
     @property
     def held(self) -> HeldForce | None:
@@ -319,7 +388,7 @@ class SimulationResult(RunOutcome):
     @property
     def kernel_system(self) -> Any:
         """The kernel system that the run keeps, for itself alone; None without one."""
-        return getattr(self._dense_output, "kernel_system", None)
+        return getattr(self._run.dense, "kernel_system", None)
 
     @property
     def steps_to_save(self) -> StepData:
@@ -364,15 +433,10 @@ class SimulationResult(RunOutcome):
             self.mechanism,
             self._system,
             self.scheme,
-            self.steps,
-            dense=self._dense,
+            self._whole,
             t_eval=np.clip(times, self.steps.times[0], self.steps.end),
-            attempts=self.attempts,
             events=self._events,
             status=self.status,
-            message=self.message,
-            stats=self.stats,
-            settings=self.settings,
         )
         run.request, run.error = self.request, self.error
         return run
@@ -399,8 +463,8 @@ class SimulationResult(RunOutcome):
         rate = self.v[:, joint.idx_v]
         if joint.nq == 1:
             return self.q[:, joint.idx_q], rate
-        if self._output is not None:
-            return self._output.angles[self.mechanism.model.getJointId(name)], rate
+        if self._run.output is not None:
+            return self._run.output.angles[self.mechanism.model.getJointId(name)], rate
         states = np.hstack([self.q, self.v])
         nq = self.mechanism.model.nq
         return unwrapped_angles(joint, nq, self.steps, self.scheme, self.t, states), rate
@@ -414,8 +478,9 @@ class SimulationResult(RunOutcome):
     @cached_property
     def bifurcations(self) -> tuple[Bifurcation, ...]:
         """Singular configurations that the run reached without the momentum to choose a branch."""
-        if self._output is not None:
-            return self._output.bifurcations
+        known = self._run.bifurcations
+        if known is not None:
+            return known
         failed = self.status is RunStatus.FAILED
         return find_bifurcations(self._system, self.steps, self._dense, failed)
 

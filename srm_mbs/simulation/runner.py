@@ -10,19 +10,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, TypeVar
+from functools import cached_property, partial
+from typing import Any, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
-from srm_mbs.dynamics.dae import DaeSystem
 from srm_mbs.dynamics.forces import over_half_turn
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
-from srm_mbs.dynamics.scaling import constraint_units
+from srm_mbs.dynamics.scaling import Units, constraint_units
 from srm_mbs.dynamics.system import System
 from srm_mbs.errors import (
     ControllerError,
@@ -53,6 +53,7 @@ from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
 from srm_mbs.integration.kernel.marshalling import state_from
+from srm_mbs.integration.kernel.observables import CompiledObservables
 from srm_mbs.integration.kernel.run import CompiledRun, first_stage
 from srm_mbs.integration.kernel.system import Evaluator, shared, workspace
 from srm_mbs.integration.messages import (
@@ -67,6 +68,7 @@ from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
 from srm_mbs.integration.singular_endpoints import start
+from srm_mbs.integration.singular_passages import Bifurcation, find_bifurcations
 from srm_mbs.model.forces import LimitSpring
 from srm_mbs.model.mechanism import per_model, per_start
 from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
@@ -84,6 +86,7 @@ from srm_mbs.simulation.options import (
     tightest_rtol,
 )
 from srm_mbs.simulation.result import (
+    KnownRunData,
     RunOutcome,
     Settings,
     SimulationResult,
@@ -199,7 +202,6 @@ def run_segment(
         raise_at_first_call(record.error, options.t0)
     lead_with_cause(problem, record)
     result = assemble_result(problem, record, counters, kernel_system, result_type)
-    result.message += bifurcation_sentences(result)
     log_end(mechanism.name, result)
     return result
 
@@ -299,7 +301,6 @@ def mechanism_method(method: str | Method, tableau: str | ButcherTableau | None)
     return checked
 
 
-@per_start
 def _units_of_states(mechanism: Mechanism) -> FloatArray:
     """The unit of each tangent component (2 nv,)."""
     units = mechanism.structure.units
@@ -319,16 +320,16 @@ def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArr
     return np.broadcast_to(array, (2 * nv,)).copy()
 
 
-@per_start
-def _usual_norms(mechanism: Mechanism) -> dict[tuple[float, float], ErrorNorm]:
-    """Error norms without an absolute tolerance of the user, by rtol and ``negligible``."""
+@per_model
+def _usual_norms(mechanism: Mechanism) -> dict[tuple[float, float, Units], ErrorNorm]:
+    """Error norms without an absolute tolerance of the user, by rtol, ``negligible`` and units."""
     return {}
 
 
 def error_norm(mechanism: Mechanism, options: RunOptions) -> ErrorNorm:
     """The error norm with the tolerances of checked ``options``."""
     known = _usual_norms(mechanism)
-    key = options.rtol, options.negligible
+    key = options.rtol, options.negligible, mechanism.structure.units
     if options.atol is None and key in known:
         return known[key]
     atol = absolute_tolerance(mechanism, options.atol, options.rtol)
@@ -360,8 +361,15 @@ def _accepted_times(mechanism: Mechanism) -> set[float]:
     return set()
 
 
-def check_consistent(mechanism: Mechanism, t: float = 0.0) -> None:
+def check_consistent(
+    mechanism: Mechanism, t: float = 0.0, observables: CompiledObservables | None = None
+) -> None:
     """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates.
+
+    Parameters
+    ----------
+    observables
+        Evaluates them; None: the reference does.
 
     Raises
     ------
@@ -370,13 +378,15 @@ def check_consistent(mechanism: Mechanism, t: float = 0.0) -> None:
     """
     accepted = _accepted_times(mechanism)
     if t not in accepted:
-        _check_errors(mechanism, t)
+        _check_errors(mechanism, t, observables)
         accepted.add(t)
 
 
-def _check_errors(mechanism: Mechanism, t: float) -> None:
+def _check_errors(mechanism: Mechanism, t: float, observables: CompiledObservables | None) -> None:
     q0, v0 = mechanism.q0, mechanism.v0
-    if t == 0.0:
+    if observables is not None:
+        g, c = (e[0] for e in observables.closure_errors(np.array([t]), q0[None], v0[None]))
+    elif t == 0.0:
         g, c = mechanism.initial_errors
     else:
         g, c = (e[0] for e in constraint_errors(mechanism, np.array([t]), q0[None], v0[None]))
@@ -384,10 +394,10 @@ def _check_errors(mechanism: Mechanism, t: float) -> None:
         return
     units = mechanism.structure.units
     unit = constraint_units(mechanism, units)
-    speed = max(units.rate, float(np.max(np.abs(v0) / units.coordinate)))
+    speed = max(units.rate, float(np.abs(v0 / units.coordinate).max()))
     for what, values, limit in (("q0", g, CONSISTENT), ("v0", c, CONSISTENT * speed)):
         errors = np.abs(values) / unit
-        worst = int(np.argmax(errors))
+        worst = int(errors.argmax())
         if errors[worst] > limit:
             kind = "drives" if worst >= len(g) - len(mechanism.drives) else "closures"
             raise InputError(
@@ -438,7 +448,9 @@ def assemble_problem(
         system = make_system(mechanism, options.controller if held is None else held)
     mechanism.check_covers(t_end)
     if mechanism.constrained:
-        check_consistent(mechanism, t0)
+        # Rows with drives begin with the state: the kernel would have to make them anew.
+        by_kernel = by in COMPILED and not mechanism.drives
+        check_consistent(mechanism, t0, CompiledObservables(system) if by_kernel else None)
     watch = None
     if options.events is not None:
         nq = mechanism.model.nq
@@ -703,22 +715,21 @@ def failed_start(t0: float, state: FloatArray, error: Exception, unit: str = "")
 
 
 def statistics(
-    system: OpenSystem | ClosedSystem | DaeSystem,
     record: RunRecord,
     steps: int,
     zone_steps: int,
     counters: Counters,
+    work: tuple[int, int],
 ) -> Statistics:
-    """Counts of a run."""
+    """Counts of a run; ``work``: numbers of evaluations and factorisations."""
     return Statistics(
-        steps=steps,
-        rejected=sum(attempt.decision is StepDecision.REJECTED for attempt in record.attempts),
-        placements=sum(counter.placed for counter in counters),
-        replaced=sum(counter.replaced for counter in counters),
-        zone_steps=zone_steps,
-        evaluations=system.evaluations,
-        factorisations=system.factorisations,
-        wall_time=record.wall_time,
+        steps,
+        sum(attempt.decision is StepDecision.REJECTED for attempt in record.attempts),
+        sum(counter.placed for counter in counters),
+        sum(counter.replaced for counter in counters),
+        zone_steps,
+        *work,
+        record.wall_time,
     )
 
 
@@ -745,6 +756,133 @@ def settings(
     )
 
 
+class FinishedRun:
+    """The data of a run that has ended (:class:`~srm_mbs.simulation.result.RunData`).
+
+    Most runs of a sweep or a loop need few of them: each is computed when it is first read.  What
+    may call functions of the user is read at once.
+
+    Parameters
+    ----------
+    problem, record, counters, kernel_system
+        From :func:`integrate_problem`.
+    result_type
+        Class of the result, if the run has to be made again.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        record: RunRecord,
+        counters: Counters,
+        kernel_system: Any,
+        result_type: type[SimulationResult],
+    ) -> None:
+        self._system, options = problem.system, problem.options
+        self._mechanism, self._norm = problem.mechanism, problem.norm
+        self._options = options if options.progress is False else options._replace(progress=False)
+        self._backend, self._passages = problem.backend, problem.passages
+        self._kernel_system = None if shared(problem.system) else kernel_system
+        self._record, self._counters = record, counters
+        # Before anything reads the dense output, which evaluates stages.
+        self._work = self._system.evaluations, self._system.factorisations
+        self._controlled = options.controller is not None or self._system.has_user_forces
+        self.output: StreamedOutput | None = None
+        self.again: Callable[[], SimulationResult] | None = None
+        if problem.stream is not None:
+            last = record.data(options.method.scheme, self._system.tangent_size)
+            kept = problem.stream.finish(last, record.status is RunStatus.FAILED)
+            if isinstance(kept, StreamedOutput):
+                self.steps, self.output = None, kept
+                if not self._controlled:
+                    repeated = self._options._replace(t_eval=None)
+                    self.again = partial(run_segment, self._mechanism, repeated, result_type)
+            else:
+                self.steps = kept
+        if self._controlled or not isinstance(record, CompiledRecord):
+            _ = self.message
+        record.close()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        found = (self.steps, self.dense, self.attempts, self.message, self.stats, self.settings)
+        return KnownRunData, (*found, self.output, self.again, self.bifurcations)
+
+    @cached_property
+    def steps(self) -> StepData | None:
+        return self._record.data(self._options.method.scheme, self._system.tangent_size)
+
+    @cached_property
+    def dense(self) -> DenseOutput | None:
+        if self.steps is None:
+            return None
+        record, scheme = self._record, self._options.method.scheme
+        # The dense output of a single step is that in which the event was found.
+        end_state = record.stop_state if self.steps.count == 1 else None
+        if isinstance(record, CompiledRecord):
+            own, by = self._kernel_system, self._backend
+            return CompiledDenseOutput(own, self._system, scheme, self.steps, end_state, by)
+        return DenseOutput(self._system, scheme, self.steps, end_state)
+
+    @cached_property
+    def attempts(self) -> NDArray[np.void]:
+        return attempt_array(self._record.attempts)
+
+    @cached_property
+    def stats(self) -> Statistics:
+        if self.output is not None:
+            steps, zone_steps = self.output.count, self.output.zone_steps
+        else:
+            data = cast(StepData, self.steps)
+            steps, zone_steps = data.count, len(data.zones)
+        return statistics(self._record, steps, zone_steps, self._counters, self._work)
+
+    @cached_property
+    def settings(self) -> Settings:
+        return settings(
+            self._options, self._norm, self._controlled, self._backend, self._stiff_intervals
+        )
+
+    @property
+    def _stiff_intervals(self) -> list[tuple[float, float]]:
+        data = self.output or self.steps
+        return [] if data is None else data.stiff_intervals
+
+    @cached_property
+    def bifurcations(self) -> tuple[Bifurcation, ...]:
+        if self.output is not None:
+            return self.output.bifurcations
+        failed = self._record.status is RunStatus.FAILED
+        return find_bifurcations(self._system, self.steps, self.dense, failed)  # type: ignore[arg-type]
+
+    @cached_property
+    def message(self) -> str:
+        options, record = self._options, self._record
+        method = options.method
+        return (
+            record.message
+            + branch_changes(suspected(self._counters), "the velocity turned", SMALLER_STEPS)
+            + method_messages(method, record.steps, self._norm)
+            + ("" if self._passages is None else self._passages.message())
+            + stiffness_sentence(self._stiff_intervals, method.scheme, options.step is None)
+            + self._coordinate_sentences()
+            + _driven_too_far(self._mechanism, record)
+            + bifurcation_sentences(self.bifurcations)
+        )
+
+    def _coordinate_sentences(self) -> str:
+        """What there is to say of the coordinates of the ends of the steps."""
+        output = self.output
+        if output is not None:
+            least, largest, turned = output.least, output.largest, output.over_half_turn
+        else:
+            dense = cast(DenseOutput, self.dense)
+            q = dense.nodes()[1][:, : self._mechanism.model.nq]
+            # The reductions themselves: their methods cost more than they do here.
+            least, largest = np.minimum.reduce(q), np.maximum.reduce(q)
+            turned = over_half_turn(self._mechanism, q)
+        return _limits_left(self._mechanism, least, largest) + _half_turns(turned)
+
+
 def assemble_result(
     problem: Problem,
     record: RunRecord,
@@ -752,63 +890,15 @@ def assemble_result(
     kernel_system: Any,
     result_type: type[Result],
 ) -> Result:
-    """Arrays, statistics and message of a run."""
-    system, options, mechanism = problem.system, problem.options, problem.mechanism
-    scheme = options.method.scheme
-    last = record.data(scheme, system.tangent_size)
-    data: StepData | None = last
-    output: StreamedOutput | None = None
-    if problem.stream is not None:
-        kept = problem.stream.finish(last, record.status is RunStatus.FAILED)
-        data, output = (None, kept) if isinstance(kept, StreamedOutput) else (kept, None)
-    dense: DenseOutput | None = None
-    again = None
-    if data is not None:
-        # The dense output of a single step is that in which the event was found.
-        end_state = record.stop_state if data.count == 1 else None
-        if isinstance(record, CompiledRecord):
-            own = None if shared(system) else kernel_system
-            dense = CompiledDenseOutput(own, system, scheme, data, end_state, problem.backend)
-        else:
-            dense = DenseOutput(system, scheme, data, end_state)
-        # Counted before anything below reads the dense output, which evaluates stages.
-        stats = statistics(system, record, data.count, len(data.zones), counters)
-        q = dense.nodes()[1][:, : mechanism.model.nq]
-        # The reductions themselves: their methods cost more than they do here.
-        least, largest = np.minimum.reduce(q), np.maximum.reduce(q)
-        turned = over_half_turn(mechanism, q)
-        stiff = data.stiff_intervals
-    elif output is not None:
-        stats = statistics(system, record, output.count, output.zone_steps, counters)
-        least, largest, turned = output.least, output.largest, output.over_half_turn
-        stiff = output.stiff_intervals
-        if options.controller is None and not system.has_user_forces:
-            again = partial(
-                run_segment, mechanism, options._replace(t_eval=None, progress=False), result_type
-            )
-    controlled = options.controller is not None or system.has_user_forces
+    """The result of a run, from what :func:`integrate_problem` returned."""
     result = result_type(
-        mechanism,
-        system,
-        scheme,
-        data,
-        dense=dense,
-        output=output,
-        again=again,
-        t_eval=options.t_eval,
-        attempts=attempt_array(record.attempts),
+        problem.mechanism,
+        problem.system,
+        problem.options.method.scheme,
+        FinishedRun(problem, record, counters, kernel_system, result_type),
+        t_eval=problem.options.t_eval,
         events=None if problem.watch is None else problem.watch.found(),
         status=record.status,
-        message=record.message
-        + branch_changes(suspected(counters), "the velocity turned", SMALLER_STEPS)
-        + method_messages(options.method, record.steps, problem.norm)
-        + ("" if problem.passages is None else problem.passages.message())
-        + stiffness_sentence(stiff, scheme, options.step is None)
-        + _limits_left(mechanism, least, largest)
-        + _half_turns(turned)
-        + _driven_too_far(mechanism, record),
-        stats=stats,
-        settings=settings(options, problem.norm, controlled, problem.backend, stiff),
     )
     result.error = record.error
     return result
@@ -832,9 +922,8 @@ def _driven_too_far(mechanism: Mechanism, record: RunRecord) -> str:
     return f" A drive ({names}) may lead where the mechanism cannot follow."
 
 
-def bifurcation_sentences(result: SimulationResult) -> str:
+def bifurcation_sentences(found: Sequence[Bifurcation]) -> str:
     """A sentence for each singular configuration that was reached without momentum."""
-    found = result.bifurcations
     more = f" There were {len(found)} of them." if len(found) > DESCRIBED_BIFURCATIONS else ""
     return "".join(f" {bifurcation}." for bifurcation in found[:DESCRIBED_BIFURCATIONS]) + more
 

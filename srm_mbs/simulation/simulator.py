@@ -117,6 +117,7 @@ class Simulator:
         kind: type[IncrementalRun] = KernelRun if self._backend in COMPILED else ReferenceRun
         self._run = kind(self._system, held, self._norm, options)
         self._nq = self._mechanism.model.nq
+        self._smooth = not len(self._mechanism.breakpoints(-math.inf, math.inf))
         self._wall_time = 0.0
         self._forces: deque[FloatArray] = deque(maxlen=WATCHED_FORCES)
         self._last_dt = math.inf
@@ -181,46 +182,29 @@ class Simulator:
         """
         started = time.perf_counter()
         dt = positive(dt, "dt", " of seconds")
-        force = self._no_force
-        if tau is not None:
-            force = self._force(tau)
-        t = self.t
+        force = self._no_force if tau is None else self._force(tau)
+        run, t = self._run, self.t
         end = t + dt
         if dt <= NEGLIGIBLE_DT * math.ulp(t):
-            if not end > t:
-                raise InputError(
-                    f"dt = {safe_repr(dt)} s is below the rounding of t = {t!r} s",
-                    element="dt",
-                    remedy="Give a longer one, or reset to an earlier time",
-                )
-            self._pending_start = end, self._state()
-            return self.q, self.v
+            return self._move_time(t, end, dt)
         if dt > RESTART_GROWTH * self._last_dt:
             self._pending_start = t, self._state()
         self._last_dt = dt
         if self._pending_start is not None:
             if not np.isfinite(force).all():
                 raise _bad_force(tau)
-            try:
-                self._run.begin(*self._pending_start, force, dt)
-            except EvaluationError as error:
-                raise SimulationError(f"Stopped at t = {t:.6g} s: {error}.", None) from error
-            self._pending_start = None
-        run = self._run
+            self._begin(*self._pending_start, force, dt)
         self._forces.append(force)
-        before = run.steps
         if self._busy:
             cause = self._watch().cause(dt)
             if cause is not None:
                 raise _failed(t, cause)
         try:
-            # Breakpoints at the ends count, too: forces just before and just after them differ.
-            beside = BREAKPOINT_ROUNDING * (abs(t) + dt)
-            kinks = self._mechanism.breakpoints(t - beside, end + beside)
-            if len(kinks):
-                self._piecewise(np.asarray(kinks, dtype=float), t, end, force)
-            else:
+            if self._smooth:
                 run.go_on(end, -math.inf, math.inf, force, False, self._grid(dt))
+                self._busy = run.last_steps >= MANY_STEPS
+            else:
+                self._piecewise(t, end, force)
         except ValueError as error:
             raise _bad_force(tau) from error
         except SimulationError as error:
@@ -230,9 +214,39 @@ class Simulator:
             raise _failed(self.t, cause) from error
         finally:
             self._wall_time += time.perf_counter() - started
-        self._busy = run.steps - before >= MANY_STEPS
         state = run.state
         return state[: self._nq], state[self._nq :]
+
+    def _move_time(self, t: float, end: float, dt: float) -> tuple[FloatArray, FloatArray]:
+        """Go on from ``t`` to ``end`` (s) in the same state: a step ``dt`` (s) within rounding.
+
+        Raises
+        ------
+        InputError
+            If ``dt`` is below the rounding of ``t``.
+        """
+        if not end > t:
+            raise InputError(
+                f"dt = {safe_repr(dt)} s is below the rounding of t = {t!r} s",
+                element="dt",
+                remedy="Give a longer one, or reset to an earlier time",
+            )
+        self._pending_start = end, self._state()
+        return self.q, self.v
+
+    def _begin(self, t: float, state: FloatArray, force: FloatArray, dt: float) -> None:
+        """Start the run from ``state`` at ``t`` (s), under ``force`` (nv,), for steps ``dt`` (s).
+
+        Raises
+        ------
+        SimulationError
+            If the first stage cannot be evaluated.
+        """
+        try:
+            self._run.begin(t, state, force, dt)
+        except EvaluationError as error:
+            raise SimulationError(f"Stopped at t = {t:.6g} s: {error}.", None) from error
+        self._pending_start = None
 
     def _watch(self) -> HeldForceWatch:
         """The signs of an unstable controller in the forces of the last samples."""
@@ -265,14 +279,20 @@ class Simulator:
         step = self._options.step
         return 0.0 if step is None else length / math.ceil(length / step - 1e-9)
 
-    def _piecewise(self, kinks: FloatArray, t: float, end: float, force: FloatArray) -> None:
+    def _piecewise(self, t: float, end: float, force: FloatArray) -> None:
         """Go on from ``t`` to ``end`` (s) across breakpoints."""
+        # Breakpoints at the ends count, too: forces just before and just after them differ.
+        beside = BREAKPOINT_ROUNDING * (abs(t) + end - t)
+        kinks = np.array(self._mechanism.breakpoints(t - beside, end + beside), dtype=float)
         intervals = smooth_intervals(kinks, np.zeros(0), t, end)
+        steps = 0
         for k, until in enumerate(intervals.ends.tolist()):
             first, last = float(intervals.first[k]), float(intervals.last[k])
             forces_jumped = k > 0 or first > -math.inf
             grid = self._grid(until - self._run.t)
             self._run.go_on(until, first, last, force, forces_jumped, grid)
+            steps += self._run.last_steps
+        self._busy = steps >= MANY_STEPS
 
     def reset(
         self, q: Any = None, v: Any = None, t: float = 0.0, *, project: bool = False

@@ -55,7 +55,7 @@ from srm_mbs.model.pinocchio_archive import model_from_archive
 from srm_mbs.model.reach import Reach
 from srm_mbs.simulation import saved_run
 from srm_mbs.simulation.options import REPEATED, RunOptions
-from srm_mbs.simulation.result import Settings, SimulationResult, Statistics
+from srm_mbs.simulation.result import KnownRunData, Settings, SimulationResult, Statistics
 from srm_mbs.simulation.saved_run import Arrays
 from srm_mbs.simulation.segmented_result import R, ResultTypes, SegmentedResult
 
@@ -436,15 +436,17 @@ def run_from(arrays: Arrays, path: Path, result_type: type[R], reach: Reach = NO
         mechanism,
         system,
         scheme,
-        steps,
-        dense=dense,
+        KnownRunData(
+            steps,
+            dense,
+            saved_run.attempts_from(arrays),
+            entry.message,
+            Statistics(**entry.stats.model_dump()),
+            settings,
+        ),
         t_eval=saved_run.output_times_from(arrays, float(steps.times[0])),
-        attempts=saved_run.attempts_from(arrays),
         events=events,
         status=entry.status,
-        message=entry.message,
-        stats=Statistics(**entry.stats.model_dump()),
-        settings=settings,
     )
     solution.request = _request(entry.request)
     return solution

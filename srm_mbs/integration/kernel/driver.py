@@ -30,7 +30,7 @@ class CompiledRecord(RunRecord):
     Attributes
     ----------
     run
-        Holds the steps.
+        Holds the steps; None after :meth:`close`.
     placed, replaced
         Numbers of steps that were placed around a singular configuration, and of attempts that
         were repeated for it.
@@ -39,15 +39,26 @@ class CompiledRecord(RunRecord):
     run: Any = None
     placed: int = 0
     replaced: int = 0
+    _suspects: Sequence[float] = ()
+    _records: Any = None
+    """The steps, once the run is closed."""
 
     def suspect_times(self) -> list[float]:
         """Ends (s) of steps that were accepted although they may have changed the branch."""
-        return list(self.run.suspect_times())
+        return list(self._suspects if self.run is None else self.run.suspect_times())
+
+    def close(self) -> None:
+        """Let go of the run, which refers to a workspace; its steps remain."""
+        self._suspects, self._records = self.run.suspect_times(), self._taken()
+        self.run = None
+
+    def _taken(self) -> Any:
+        start = (self.t0, self.x0) if self.rest is None else self.rest
+        return self.run.take_records(*start)
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
-        start = (self.t0, self.x0) if self.rest is None else self.rest
-        return steps_from(self.run.take_records(*start), self.stop)
+        return steps_from(self._taken() if self.run is not None else self._records, self.stop)
 
 
 def integrate(

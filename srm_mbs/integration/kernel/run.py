@@ -111,6 +111,11 @@ class CompiledRun:
         Residual (row units) up to which a critical configuration counts as singular; None where
         they are not examined.
 
+    Attributes
+    ----------
+    core
+        The ``Run`` of the kernel, whose attributes this object has, too.
+
     Raises
     ------
     ArithmeticError
@@ -149,7 +154,7 @@ class CompiledRun:
             rtol=norm.rtol,
             eps=method.regularisation,
         )
-        self._run = core.Run(  # type: ignore[union-attr]
+        self.core = core.Run(  # type: ignore[union-attr]
             kernel_system,
             marshalling.tableau_struct(method.scheme),
             None if stiff is None else marshalling.tableau_struct(stiff),
@@ -163,7 +168,7 @@ class CompiledRun:
 
     def advance(self, steps: int = 0) -> ReturnReason:
         """Make ``steps`` steps, or with 0 those of CHUNK seconds; the reason of the return."""
-        return ReturnReason(self._run.advance(steps, CHUNK))
+        return ReturnReason(self.core.advance(steps, CHUNK))
 
     def attempt_from(
         self, t: float, state: FloatArray, memory: IntegratorState, control: Any
@@ -183,15 +188,15 @@ class CompiledRun:
         The reason of the return, and the decision; None if no step was made.
         """
         known = marshalling.state_struct(memory)
-        reason, decision = self._run.attempt_from(t, state, known, control)
+        reason, decision = self.core.attempt_from(t, state, known, control)
         return ReturnReason(reason), None if decision < 0 else DECISIONS[decision]
 
     def last(self) -> StepResult:
         """The step made last."""
-        r = self._run.last()
+        r = self.core.last()
         history, zone = None, None
         if r.in_zone:
-            history = marshalling.history_from(self._run.last_history())
+            history = marshalling.history_from(self.core.last_history())
             zone = Zone(r.zone_threshold, history.predict_near, history.normals)
         return StepResult(
             **{name: getattr(r, name) for name in _STEP_RESULT},
@@ -204,16 +209,16 @@ class CompiledRun:
 
     def step_dense(self, system: System, start: FloatArray) -> StepDense:
         """Dense output of the step made last, from the state ``start``."""
-        scheme, t = self.method.scheme, self._run.t
+        scheme, t = self.method.scheme, self.core.t
 
         def by_reference() -> StepDense:
             return step_dense(system, scheme, start, self.last(), t)
 
-        last = self._run.last()
+        last = self.core.last()
         if last.in_zone or last.critical:
             return by_reference()
-        own = scheme.member(self._run.last().stiff)
-        compiled = self._run.step_dense(start, *marshalling.dense_structs(own))
+        own = scheme.member(self.core.last().stiff)
+        compiled = self.core.step_dense(start, *marshalling.dense_structs(own))
 
         def states(times: FloatArray) -> FloatArray:
             try:
@@ -225,7 +230,7 @@ class CompiledRun:
 
     def memory(self) -> IntegratorState:
         """The state of the integrator before the next step."""
-        return marshalling.state_from(self._run.memory())
+        return marshalling.state_from(self.core.memory())
 
     def pass_breakpoint(self, passing: BreakpointHandler) -> None:
         """Enter the interval after a breakpoint at which the kernel returned.
@@ -237,32 +242,32 @@ class CompiledRun:
         EvaluationError
             If the first stage cannot be evaluated, or the motion after it is not determined.
         """
-        t, state = self._run.t, self._run.state
+        t, state = self.core.t, self.core.state
         before = self.memory()
         accurate = False
-        if self._run.at_breakpoint:
-            passing.enter(self._run.interval + 1, t, state)
+        if self.core.at_breakpoint:
+            passing.enter(self.core.interval + 1, t, state)
             with suppress(ArithmeticError):  # the reference raises the error that says why
-                accurate = self._run.enter()
+                accurate = self.core.enter()
         else:
-            passing.follow(self._run.interval)
+            passing.follow(self.core.interval)
         if not accurate:
             self.remember(passing.resolved(t, state, before))
 
     def arrive(self, passing: BreakpointHandler) -> None:
         """Prepare for the end next to a singular configuration before which the kernel returned."""
-        run = self._run
+        run = self.core
         self.remember(passing.singular_arrival(run.t, run.state, self.memory(), run.interval))
 
     def remember(self, memory: IntegratorState) -> None:
         """Start the next step from ``memory``."""
-        self._run.remember(marshalling.state_struct(memory))
+        self.core.remember(marshalling.state_struct(memory))
 
     def begin(
         self, t: float, state: FloatArray, memory: IntegratorState, first_step: float
     ) -> None:
         """Start again, from ``state`` at ``t`` (s); the counts of steps and evaluations stay."""
-        self._run.restore(
+        self.core.restore(
             core.RunSnapshot(  # type: ignore[union-attr]
                 t=t,
                 state=state,
@@ -278,4 +283,4 @@ class CompiledRun:
         )
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._run, name)
+        return getattr(self.core, name)

@@ -86,10 +86,15 @@ class KnownKeys(dict[str, Values]):
 
 def known_names(names: Iterable[str]) -> str:
     """The remedy that lists ``names``: the first MOST_LISTED, and how many more there are."""
+    return f"Known: {joined_names(names)}"
+
+
+def joined_names(names: Iterable[str]) -> str:
+    """The first MOST_LISTED of ``names``, and how many more there are; "none" without any."""
     every = tuple(names)
     more = len(every) - MOST_LISTED
     listed = ", ".join(every[:MOST_LISTED]) or "none"
-    return f"Known: {listed} and {more} more" if more > 0 else f"Known: {listed}"
+    return f"{listed} and {more} more" if more > 0 else listed
 
 
 class _Printable(logging.Filter):

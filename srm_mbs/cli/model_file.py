@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import wraps
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
@@ -49,6 +50,10 @@ Parameters = Annotated[
     list[str] | None,
     several("--set", "NAME=VALUE", "Value of a parameter of a description."),
 ]
+MeshDirs = Annotated[
+    list[Path] | None,
+    several("--mesh-dirs", "DIR", "Further folder of meshes and other files that the model names."),
+]
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,7 @@ class ModelFile:
     massless: Massless = None
     closing_tolerance: ClosingTolerance = None
     parameters: Parameters = None
+    mesh_dirs: MeshDirs = None
 
     def options(self) -> dict[str, Any]:
         """The options as ``srm_mbs.load`` takes them.
@@ -77,6 +83,7 @@ class ModelFile:
             "massless": massless_ends(self.massless),
             "closing_tolerance": self.closing_tolerance,
             "parameters": parameter_values(self.parameters or ()),
+            "mesh_dirs": self.mesh_dirs or (),
         }
 
     def load(self, **more: Any) -> Mechanism:

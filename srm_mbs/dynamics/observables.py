@@ -15,7 +15,7 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
-from srm_mbs.dynamics.constraints.reactions import reactions_at
+from srm_mbs.dynamics.constraints.reactions import Reactions, reactions_at
 from srm_mbs.dynamics.constraints.rheonomic import all_rows, constraint_errors
 from srm_mbs.dynamics.constraints.row_algebra import SingularValues
 from srm_mbs.dynamics.forces import ForceKinematics
@@ -120,7 +120,30 @@ class Observables:
         EvaluationError, ControllerError
             If the equations of motion cannot be evaluated.
         """
-        return reactions_at(self.system, t, q, v).drives
+        return self.reactions(t, q, v).drives
+
+    def reactions(self, t: FloatArray, q: FloatArray, v: FloatArray) -> Reactions:
+        """Reactions of closures and joints, multipliers, and forces of drives.
+
+        Raises
+        ------
+        EvaluationError, ControllerError
+            If the equations of motion cannot be evaluated.
+        """
+        return reactions_at(self.system, t, q, v)
+
+    def accelerations(self, t: FloatArray, q: FloatArray, v: FloatArray) -> FloatArray:
+        """v' (n, nv) of the equations of motion.
+
+        Raises
+        ------
+        EvaluationError, ControllerError
+            If the equations of motion cannot be evaluated.
+        """
+        nv = self.mechanism.model.nv
+        states = np.hstack([q, v])
+        rates = [self.system.evaluate(time, x).rate()[nv:].copy() for time, x in zip(t, states)]
+        return np.array(rates).reshape(len(rates), nv)
 
     def powers(self, t: FloatArray, q: FloatArray, v: FloatArray) -> dict[str, FloatArray]:
         """Power (n,) W of each force element but that of its potential, by name.

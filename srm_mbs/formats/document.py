@@ -55,6 +55,13 @@ class Document:
             )
         return cls(read_text(path), str(path))
 
+    @classmethod
+    def of_tables(cls, tables: dict[str, Any], name: str) -> Document:
+        """The document of these tables, which no file has, called ``name``; its text is empty."""
+        own = cls("", name)
+        own.toml = tables
+        return own
+
     @cached_property
     def toml(self) -> dict[str, Any]:
         return parse_toml(self.text, self.file)

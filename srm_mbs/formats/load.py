@@ -180,25 +180,26 @@ class _Variants:
     """A description with parameters, and the text of its model file if it names one.
 
     ``analysis`` is that of the mechanism that was loaded first: all variants are compared with it,
-    so that they do not depend on the order in which they are made.
+    so that they do not depend on the order in which they are made.  ``kind`` is their class.
     """
 
     own: Document
     overrides: Overrides
     reach: Reach
     model: str | None
+    kind: type[Mechanism] = Mechanism
     analysis: ReusableAnalysis | None = None
 
     @property
     def definition(self) -> tuple[Any, ...]:
-        return (self.own.text, self.model, self.overrides)
+        return (self.own.text or tomli_w.dumps(self.own.toml), self.model, self.overrides)
 
     def __call__(self, parameters: Mapping[str, Any]) -> Mechanism:
         values = {**self.overrides.parameters, **given_parameters(parameters)}
         with naming(file=self.own.file):
             overrides = replace(self.overrides, parameters=values)
             reading = _of_description(self.own, overrides, self.reach, self.model)
-            mechanism = assembled(replace(reading, analysis=self.analysis))
+            mechanism = assembled(replace(reading, analysis=self.analysis, kind=self.kind))
         variant_maker.keep(mechanism, replace(self, overrides=overrides))
         return mechanism
 
@@ -237,13 +238,20 @@ def _of_tables(
     return reading, model.text
 
 
-def _mechanism(reading: Reading) -> Mechanism:
-    """The assembled mechanism, which knows its variants."""
+def mechanism_of(reading: Reading) -> Mechanism:
+    """The assembled mechanism, which knows its variants.
+
+    Raises
+    ------
+    InputError, AssemblyError
+        As :func:`load`.
+    """
     with naming(file=reading.source.path):
         mechanism = assembled(reading)
     if isinstance(reading.variants, _Variants):
         analysis = ReusableAnalysis.of(mechanism)
-        variant_maker.keep(mechanism, replace(reading.variants, analysis=analysis))
+        variants = replace(reading.variants, analysis=analysis, kind=reading.kind)
+        variant_maker.keep(mechanism, variants)
     return mechanism
 
 
@@ -298,7 +306,7 @@ def read(name: str | Path, overrides: Overrides) -> Reading:
         return _of_file(Path(name), overrides)
 
 
-def read_tables(entries: Mapping[str, Any], name: str) -> Reading:
+def read_tables(entries: dict[str, Any], name: str) -> Reading:
     """Read the tables of a description with a section ``[planar]``, which messages call ``name``.
 
     Raises
@@ -306,9 +314,7 @@ def read_tables(entries: Mapping[str, Any], name: str) -> Reading:
     InputError
         For what the tables cannot be, naming the element and the remedy.
     """
-    own = Document("", name)
-    description = check_description(entries, name)
-    return _translated(own, entries, description, LINKAGE, own, Overrides(), Reach())
+    return _of_description(Document.of_tables(entries, name), Overrides(), Reach())
 
 
 def load(
@@ -379,7 +385,7 @@ def load(
         closing_tolerance,
         given_parameters(parameters),
     )
-    return _mechanism(read(path, overrides))
+    return mechanism_of(read(path, overrides))
 
 
 LARGEST_N, LARGEST_DENSE_N = 1000, 300

@@ -130,6 +130,12 @@ class Reach:
             raise self.refusal(name, what)
         raise InputError(f"there is no {what} {name!r}", remedy="Check the path")
 
+    def searched(self, folder: Path) -> tuple[Path, ...]:
+        """Where the files that a file in ``folder`` names are searched, for messages; files of a
+        package also in the folders above it."""
+        own = Path(os.path.realpath(folder))
+        return tuple(dict.fromkeys((own, *self.folders, *self.mesh_dirs, *_search_paths())))
+
     def check(self, path: Path, what: str) -> Path:
         """``path`` without symbolic links.
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.constraints.reactions import Reactions, reactions_at
+from srm_mbs.dynamics.constraints.reactions import Reactions
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
@@ -510,10 +510,7 @@ class SimulationResult(RunOutcome):
             For a loaded run that had a controller.
         """
         self._need_controller("acceleration")
-        states = np.hstack([self.q, self.v])
-        nv = self.mechanism.model.nv
-        rates = [self._system.evaluate(t, x).rate()[nv:].copy() for t, x in zip(self.t, states)]
-        return np.array(rates).reshape(len(rates), nv)
+        return self.observables.accelerations(self.t, self.q, self.v)
 
     def point(self, point: Anchor | str) -> PointMotion:
         """Motion of a point of a link at ``t``: position, velocity and acceleration (n, 3), world
@@ -570,7 +567,7 @@ class SimulationResult(RunOutcome):
     @cached_property
     def _reactions(self) -> Reactions:
         self._need_controller("reactions")
-        return reactions_at(self._system, self.t, self.q, self.v)
+        return self.observables.reactions(self.t, self.q, self.v)
 
     @property
     def reactions(self) -> Mapping[str, FloatArray]:

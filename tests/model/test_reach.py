@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from typer.testing import CliRunner
 
 import srm_mbs as srm
 from srm_mbs.cli.app import app
+from srm_mbs.formats.load import models_folder
 from srm_mbs.model.reach import Reach
 from srm_mbs.visualization.animation.shapes import Mesh, visuals_of
 from tests.support.urdf_files import tree
@@ -57,6 +59,36 @@ def test_a_symbolic_link_does_not_lead_outside(model: Path) -> None:
     assert drawn(srm.load(path, allow_outside=True))
 
 
+@pytest.mark.parametrize(("own", "rest"), [("a.obj", ["coupler", "rocker"]), ("gone.obj", [])])
+def test_one_warning_sums_up_missing_meshes_and_bars_stand_for_their_links(
+    own: str, rest: list[str], model: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (model / "a.obj").write_text(TETRAHEDRON)
+    urdf = (models_folder().parent / "urdf" / "four_bar.urdf").read_text()
+    missing = VISUAL.format("package://gone/bar.obj").removesuffix("</link>")
+    urdf = re.sub("(<visual>.*?</visual>\\s*)+", missing, urdf, flags=re.DOTALL)
+    crank = urdf.index("bar.obj", urdf.index('link name="crank"'))
+    (model / "robot.urdf").write_text(
+        urdf[:crank].removesuffix("package://gone/") + own + urdf[crank + 7 :]
+    )
+    tables = (models_folder() / "four_bar.toml").read_text()
+    (model / "robot.toml").write_text(tables.replace("../urdf/four_bar", "robot"))
+    mechanism = srm.load(model / "robot.toml", mesh_dirs=[model.parent / "other"])
+    names = ["world", *mechanism.joint_names]
+    visuals = visuals_of(mechanism)
+    assert {names[v.joint] for v in visuals if isinstance(v.shape, Mesh)} == (
+        {"crank"} if rest else set()
+    )
+    bars = {names[v.joint] for v in visuals if not isinstance(v.shape, Mesh)}
+    assert bars == {"world", *(rest or mechanism.joint_names)}
+    (record,) = caplog.records
+    said = record.getMessage()
+    gone = 3 if rest else 4
+    assert said.startswith(f"{gone} of 4 visuals are not drawn, of the links 'world', ")
+    assert "there is no mesh file 'package://gone/bar.obj'" in said
+    assert f"Searched in {model}, {model.parent / 'other'};" in said
+
+
 @pytest.mark.parametrize("manifest", ["package.xml", "model.config"])
 def test_packages_are_within_reach(
     manifest: str, model: Path, monkeypatch: pytest.MonkeyPatch
@@ -77,6 +109,17 @@ def test_the_package_of_a_model_is_within_reach(model: Path) -> None:
     assert not drawn(srm.load(robot(model / "here", "../meshes/a.obj")))
     (model / "package.xml").write_text("<package/>")
     assert drawn(srm.load(robot(model / "here", "../meshes/a.obj")))
+
+
+def test_a_name_without_a_package_is_found_in_the_package_of_the_model_and_in_named_folders(
+    model: Path,
+) -> None:
+    path = robot(model, "package:///meshes/a.obj")
+    assert not drawn(srm.load(path))
+    assert drawn(srm.load(robot(model, "package:///a.obj"), mesh_dirs=[model.parent / "other"]))
+    (model / "meshes").mkdir()
+    (model / "meshes" / "a.obj").write_text(TETRAHEDRON)
+    assert drawn(srm.load(robot(model, "package:///meshes/a.obj")))
 
 
 def test_the_home_folder_is_no_package(model: Path) -> None:

@@ -35,17 +35,27 @@ Vector3d point_velocity(const Motion& body, const Vector3d& point) {
     return body.linear() + body.angular().cross(point);
 }
 
+// What elements add to: generalised forces (nv,), and wrenches (njoints, 6) on bodies, or null.
+struct Sums {
+    double* tau;
+    double* on_bodies;
+};
+
 // tau += (J_a - J_b)^T W for a force at `point` and a moment.
 void add_wrench(const ForceElement& e, const pinocchio::Data& data, const Vector3d& force,
-                const Vector3d& moment, const Vector3d& point, double* tau) {
+                const Vector3d& moment, const Vector3d& point, const Sums& sums) {
     Vector6 wrench;
     wrench << force, moment + point.cross(force);
     for (std::size_t k = 0; k < e.columns.size(); ++k)
-        tau[e.columns[k]] += e.signs[k] * data.J.col(e.columns[k]).dot(wrench);
+        sums.tau[e.columns[k]] += e.signs[k] * data.J.col(e.columns[k]).dot(wrench);
+    if (!sums.on_bodies) return;
+    Eigen::Map<Vector6>(sums.on_bodies + 6 * e.a.joint) += wrench;
+    if (e.kind != ForceKind::wrench)
+        Eigen::Map<Vector6>(sums.on_bodies + 6 * e.b.joint) -= wrench;
 }
 
 void spring_damper(const ForceElement& e, double coincident, const pinocchio::Data& data,
-                   double* tau, ForceLaws* laws, int law) {
+                   const Sums& sums, ForceLaws* laws, int law) {
     const Vector3d at_a = placement(e.a, data).translation();
     const Vector3d at_b = placement(e.b, data).translation();
     const Vector3d apart = at_a - at_b;
@@ -67,7 +77,7 @@ void spring_damper(const ForceElement& e, double coincident, const pinocchio::Da
         const double own = force.dot(line), acting = laws->acting(law, own);
         if (acting != own) force = acting * line;
     }
-    add_wrench(e, data, force, Vector3d::Zero(), at_a, tau);
+    add_wrench(e, data, force, Vector3d::Zero(), at_a, sums);
 }
 
 // Number k of an element whose numbers may follow laws.
@@ -108,7 +118,7 @@ void coupling_spring(const ForceElement& e, const double* q, const double* v, do
     for (std::size_t k = 0; k < e.columns.size(); ++k) tau[e.columns[k]] += e.signs[k] * force;
 }
 
-void wrench(const ForceElement& e, double t, const pinocchio::Data& data, double* tau) {
+void wrench(const ForceElement& e, double t, const pinocchio::Data& data, const Sums& sums) {
     const SE3 at = placement(e.a, data);
     Vector3d force(over_time(e, 0, t), over_time(e, 1, t), over_time(e, 2, t));
     Vector3d moment(over_time(e, 3, t), over_time(e, 4, t), over_time(e, 5, t));
@@ -116,7 +126,7 @@ void wrench(const ForceElement& e, double t, const pinocchio::Data& data, double
         force = at.rotation() * force;
         moment = at.rotation() * moment;
     }
-    add_wrench(e, data, force, moment, at.translation(), tau);
+    add_wrench(e, data, force, moment, at.translation(), sums);
 }
 
 // The rotation vector of the same rotation about the opposite axis.
@@ -130,8 +140,8 @@ Vector3d rotation_vector(const ForceElement& e, const pinocchio::Data& data) {
     return pinocchio::log3(placement(e.b, data).actInv(placement(e.a, data)).rotation());
 }
 
-void bushing(const ForceElement& e, const pinocchio::Data& data, BushingStep* step, double* tau,
-             ForceLaws* laws, std::size_t number) {
+void bushing(const ForceElement& e, const pinocchio::Data& data, BushingStep* step,
+             const Sums& sums, ForceLaws* laws, std::size_t number) {
     const SE3 Ta = placement(e.a, data), Tb = placement(e.b, data);
     const SE3 relative = Tb.actInv(Ta);
     Vector3d turn = pinocchio::log3(relative.rotation());
@@ -162,7 +172,7 @@ void bushing(const ForceElement& e, const pinocchio::Data& data, BushingStep* st
     }
     const Vector3d world_force = Tb.rotation() * force;
     const Vector3d world_moment = Tb.rotation() * (L * moment);
-    add_wrench(e, data, -world_force, -world_moment, Ta.translation(), tau);
+    add_wrench(e, data, -world_force, -world_moment, Ta.translation(), sums);
 }
 
 // The integral of k d S(d / depth).
@@ -310,8 +320,10 @@ void ForceLaws::resolve(const std::vector<ForceElement>& elements,
 
 void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 const pinocchio_model::Workspace& work, double t, const double* q,
-                const double* v, std::vector<BushingStep>& step, double* tau, ForceLaws* laws) {
+                const double* v, std::vector<BushingStep>& step, double* tau, ForceLaws* laws,
+                double* on_bodies) {
     auto next = step.begin();
+    const Sums sums{tau, on_bodies};
     const auto on_joint = [&](const ForceElement& e, double force) {
         if (laws) laws->values[laws->of_coordinate(e.in_v)] += force;
         if (!laws || !laws->applied) tau[e.in_v] += force;
@@ -320,7 +332,7 @@ void add_forces(const std::vector<ForceElement>& elements, double coincident,
         const ForceElement& e = elements[number];
         switch (e.kind) {
             case ForceKind::spring_damper:
-                spring_damper(e, coincident, work.data, tau, laws,
+                spring_damper(e, coincident, work.data, sums, laws,
                               laws ? laws->of_element(number, 0) : -1);
                 break;
             case ForceKind::joint_torque:
@@ -331,10 +343,10 @@ void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 on_joint(e, torsion_spring(e, q[e.in_q], v[e.in_v]));
                 break;
             case ForceKind::wrench:
-                wrench(e, t, work.data, tau);
+                wrench(e, t, work.data, sums);
                 break;
             case ForceKind::bushing:
-                bushing(e, work.data, turns(e) && next != step.end() ? &*next++ : nullptr, tau,
+                bushing(e, work.data, turns(e) && next != step.end() ? &*next++ : nullptr, sums,
                         laws, number);
                 break;
             case ForceKind::limit_spring:

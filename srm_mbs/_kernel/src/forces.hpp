@@ -115,10 +115,13 @@ private:
 // Adds the generalised forces at t, q, v to tau (nv,).  The workspace holds the placements, the
 // velocities and the world Jacobian there.  With `laws`, their values are found, and of the forces
 // along coordinates the rest is added only if none are applied.  `step`: the bushings that have a
-// moment in the step of the stage, in their order, or none.  Throws EvaluationError.
+// moment in the step of the stage, in their order, or none.  The wrenches of elements between links,
+// about the origin of the world, are also added to `on_bodies` (njoints, 6) unless it is null.
+// Throws EvaluationError.
 void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 const pinocchio_model::Workspace& work, double t, const double* q,
-                const double* v, std::vector<BushingStep>& step, double* tau, ForceLaws* laws);
+                const double* v, std::vector<BushingStep>& step, double* tau, ForceLaws* laws,
+                double* on_bodies = nullptr);
 
 // Potential energy (J) of those that have one; the workspace holds the placements.
 double potential_energy(const std::vector<ForceElement>& elements,

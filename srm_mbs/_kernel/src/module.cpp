@@ -235,6 +235,49 @@ struct PySystem {
         return owned_array(std::move(out), {n, m});
     }
 
+    // Of n states: multipliers (n, rows), wrenches (n, closures, 6) and (n, joints, 6); see
+    // System::reactions.
+    nb::tuple reactions(PySystem& all, const Array& scale, const Array& t, const Array& states) {
+        const std::size_t n = count_of(t, states, state_size()), nx = state_size();
+        const auto rows = static_cast<std::size_t>(all.system->rows());
+        if (all.system.get() == system.get() || all.state_size() != state_size() ||
+            all.system->joint_count() != system->joint_count() || scale.size() != rows)
+            throw nb::value_error("the rows are not those of the mechanism");
+        const std::size_t closures = all.system->closure_count(), joints = system->joint_count();
+        std::vector<double> lam(n * rows), on_b(6 * n * closures), on_child(6 * n * joints);
+        const double *times = t.data(), *x = states.data(), *scales = scale.data();
+        const auto find = [&] {
+            for (std::size_t i = 0; i < n; ++i) {
+                system->evaluate(times[i], x + i * nx, System::ZoneView{});
+                system->reactions(times[i], x + i * nx, *all.system, scales, lam.data() + i * rows,
+                                  on_b.data() + 6 * i * closures,
+                                  on_child.data() + 6 * i * joints);
+            }
+        };
+        if (controller.is_none()) {  // neither system is shared with another thread
+            const WithoutLock released;
+            find();
+        } else {
+            find();
+        }
+        return nb::make_tuple(owned_array(std::move(lam), {n, rows}),
+                              owned_array(std::move(on_b), {n, closures, 6}),
+                              owned_array(std::move(on_child), {n, joints, 6}));
+    }
+
+    // Accelerations (n, nv) of n states.
+    nb::object accelerations(const Array& t, const Array& states) {
+        const std::size_t n = count_of(t, states, state_size()), nx = state_size();
+        const auto nv = static_cast<std::size_t>(system->nv);
+        std::vector<double> out(n * nv), rate(2 * nv);
+        for (std::size_t i = 0; i < n; ++i) {
+            system->evaluate(t.data()[i], states.data() + i * nx, System::ZoneView{});
+            system->rate(rate.data());
+            std::copy_n(rate.begin() + nv, nv, out.begin() + i * nv);
+        }
+        return owned_array(std::move(out), {n, nv});
+    }
+
     // The smallest singular value (n,) of the separated rows; see SeparatedRows::smallest.
     nb::object smallest_values(const SeparatedRows& rows, Algebra& algebra, const Array& t,
                                const Array& q) {
@@ -322,6 +365,9 @@ void bind_system(nb::module_& m) {
         .def("closure_errors", &PySystem::closure_errors)
         .def("jacobians", &PySystem::jacobians)
         .def("drive_forces", &PySystem::drive_forces)
+        .def("reactions", &PySystem::reactions, nb::arg("all"), nb::arg("scale"), nb::arg("t"),
+             nb::arg("states"))
+        .def("accelerations", &PySystem::accelerations, nb::arg("t"), nb::arg("states"))
         .def("smallest_values", &PySystem::smallest_values)
         .def("energies", &PySystem::energies)
         .def("powers", &PySystem::powers, nb::arg("t"), nb::arg("states"), nb::arg("elements"),

@@ -229,6 +229,15 @@ public:
     // Also then, in the order of the drives: the forces on their coordinates; false where rows
     // depend on each other, which leaves the forces open.
     bool drive_forces(double* out);
+    // The forces within the mechanism at the stage of `state` at t, evaluated last; `all`, a system of
+    // the same model, has all rows, whose scales are `scale` (rows,).  Multipliers (rows,) of all
+    // rows; of its closures the wrenches (closures, 6) on b at b's origin; and of the joints those
+    // (njoints, 6) of the parent on the child at the joint's origin: force, moment, in world axes.
+    // Placements and velocities of the stage are the same afterwards, its other terms are lost.
+    void reactions(double t, const double* state, System& all, const double* scale,
+                   double* multipliers, double* on_b, double* joints);
+    std::size_t closure_count() const { return data_.closures.size(); }
+    int joint_count() const;
     void mass_times(const double* x, double* out) const;
     void working_forces(double* all, double* working);
     const std::vector<double>& bias() const { return bias_; }
@@ -276,6 +285,9 @@ public:
 private:
     Pattern pattern() const;
     void move_bodies(const double* state);
+    // Those (rows,) of generalised forces of the closures (nv,), of rows G (rows, nv + 1).
+    void row_multipliers(const double* generalised, const std::vector<double>& G,
+                         const double* scale, int rows, double* out);
     // Row `row` of G (nv,), cleared; and after it was written.
     double* column(int row);
     double* filled(int row);

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from itertools import accumulate
 from typing import Self
 
 import numpy as np
@@ -43,6 +44,7 @@ from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import KnownKeys
+from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import in_order_of_rows
 
 _System = OpenSystem | ClosedSystem
@@ -104,7 +106,6 @@ def _block(system: _System, t: FloatArray, q: FloatArray, v: FloatArray) -> Reac
     """:func:`reactions_at`, with all intermediate results in memory at once."""
     mechanism, n = system.mechanism, len(t)
     model = mechanism.model
-    ordered = in_order_of_rows(mechanism.drives)
     closures = [*mechanism.loops, *driven_closures(mechanism.drives)]
     lam = np.zeros((n, sum(closure.rows.count for closure in closures)))
     inertial, loads = np.zeros((2, n, model.njoints, 6))
@@ -122,28 +123,51 @@ def _block(system: _System, t: FloatArray, q: FloatArray, v: FloatArray) -> Reac
         pin.rnea(model, data, q[i], v[i], a)
         for j, force in enumerate(data.f):
             inertial[i, j] = force.vector
-    ends = np.cumsum([closure.rows.count for closure in closures], dtype=int)
-    multipliers = [lam[:, end - c.rows.count : end] for c, end in zip(closures, ends.tolist())]
-    wrenches = [
-        np.einsum("nrk,nr->nk", row_wrenches(closure, model, placed), own)
-        if closure.anchors
-        else None
-        for closure, own in zip(closures, multipliers)
-    ]
-    for closure, at_b in zip(closures, wrenches):
-        if at_b is not None:
+    wrenches = []
+    for closure, own in zip(closures, _by_closure(closures, lam)):
+        if closure.anchors:
+            at_b = np.einsum("nrk,nr->nk", row_wrenches(closure, model, placed), own)
             on_b = about_origin(at_b, closure, model, placed)
             add_between(loads, bodies_of(closure, model), on_b)
+            wrenches.append(at_b)
     halves = inertial.reshape(n, model.njoints, 2, 3, 1)
     turned = (placed.rotation[:, :, None] @ halves).reshape(inertial.shape)
     joints = turned - moved(sums_of_subtrees(model, loads), placed.origin)
-    driven = zip(ordered, multipliers[len(mechanism.loops) :])
+    on_b = np.array(wrenches).reshape(len(wrenches), n, 6)
+    return named_reactions(mechanism, lam, on_b, joints)
+
+
+def named_reactions(
+    mechanism: Mechanism, lam: FloatArray, on_b: FloatArray, joints: FloatArray
+) -> Reactions:
+    """Reactions by name.
+
+    Parameters
+    ----------
+    lam : (n, rows)
+        Multipliers of all rows, those of drives last.
+    on_b : (closures, n, 6)
+        Wrenches on b of the closures between anchors, those of drives last.
+    joints : (n, njoints, 6)
+        Wrenches on the children.
+    """
+    drives = in_order_of_rows(mechanism.drives)
+    closures = [*mechanism.loops, *driven_closures(mechanism.drives)]
+    multipliers = _by_closure(closures, lam)
+    between = [loop.name for loop in mechanism.loops if loop.anchors]
+    driven = zip(drives, multipliers[len(mechanism.loops) :])
     return Reactions(
-        KnownKeys((c.name, w) for c, w in zip(mechanism.loops, wrenches) if w is not None),
+        KnownKeys(zip(between, on_b)),
         KnownKeys((c.name, own) for c, own in zip(mechanism.loops, multipliers)),
         KnownKeys((drive.name, -own[:, 0]) for drive, own in driven),
-        KnownKeys((name, joints[:, model.getJointId(name)]) for name in mechanism.joint_names),
+        KnownKeys(zip(mechanism.joint_names, np.moveaxis(joints, 1, 0)[1:])),
     )
+
+
+def _by_closure(closures: Sequence[LoopClosure], lam: FloatArray) -> list[FloatArray]:
+    """Columns of ``lam`` (n, rows) of each closure."""
+    counts = [closure.rows.count for closure in closures]
+    return [lam[:, end - own : end] for own, end in zip(counts, accumulate(counts))]
 
 
 def _multipliers(

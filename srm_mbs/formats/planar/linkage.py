@@ -10,17 +10,21 @@ from typing import Any, cast
 import numpy as np
 
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError, known_names, naming, safe_repr
+from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.formats.build import Reading, assembled
 from srm_mbs.formats.convert import write_description
 from srm_mbs.formats.files import check_name
-from srm_mbs.formats.load import read_tables
+from srm_mbs.formats.load import mechanism_of, read_tables
 from srm_mbs.formats.toml.description import check_description, parse_toml
+from srm_mbs.formats.toml.parameters import PARAMETERS
 from srm_mbs.formats.translation import PLANAR
 from srm_mbs.formats.xml import parse_xml
 from srm_mbs.model.laws import ConstantSpeed, Law, Samples
 from srm_mbs.model.mechanism import Source
 from srm_mbs.model.numbers import checked_name, name_list, named_values, plain
+
+Number = float | str
+"""A number, or an expression over parameters such as ``"=2*crank"``."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -76,25 +80,26 @@ def _reading(source: Source) -> Reading:
 
 def planar(
     *,
-    points: Mapping[str, Sequence[float]],
+    points: Mapping[str, Sequence[Number]],
     bars: Mapping[str, Sequence[str] | Mapping[str, Any]],
     ground: Sequence[str],
     sliders: Mapping[str, Mapping[str, Any]] | None = None,
-    lengths: Mapping[str | tuple[str, str], float] | None = None,
+    lengths: Mapping[str | tuple[str, str], Number] | None = None,
     unit: str = "m",
     angle: str = "rad",
-    mass_per_length: float | None = None,
-    masses: Mapping[str, float] | None = None,
-    inertias: Mapping[str, float] | None = None,
-    start: Mapping[str, float] | None = None,
-    rates: Mapping[str, float] | None = None,
+    mass_per_length: Number | None = None,
+    masses: Mapping[str, Number] | None = None,
+    inertias: Mapping[str, Number] | None = None,
+    start: Mapping[str, Number] | None = None,
+    rates: Mapping[str, Number] | None = None,
     springs: Sequence[Mapping[str, Any]] = (),
-    torques: Mapping[str, float] | None = None,
-    loads: Mapping[str, Sequence[float]] | None = None,
-    drives: Mapping[str, float | Law | Mapping[str, Any]] | None = None,
-    gravity: Sequence[float] | None = None,
+    torques: Mapping[str, Number] | None = None,
+    loads: Mapping[str, Sequence[Number]] | None = None,
+    drives: Mapping[str, Number | Law | Mapping[str, Any]] | None = None,
+    gravity: Sequence[Number] | None = None,
     name: str = "linkage",
     cut: Sequence[str] = (),
+    parameters: Mapping[str, Number] | None = None,
 ) -> Linkage:
     """A planar linkage from the points and bars of one closed pose, assembled.
 
@@ -104,6 +109,10 @@ def planar(
     their sliders.  The angle of a pin on the ground is that of its bar against x, elsewhere that of
     its bar against the one nearer to the ground; a bar points from the pin that carries it to the
     next of its points.  The same keys are a section of a description (docs/formats.md).
+
+    Wherever a number stands an expression over ``parameters`` may stand, a text that begins with
+    ``=``: ``points={"A": ("=crank", 0), ...}, parameters={"crank": 40}``.
+    ``linkage.with_parameters(crank=50)`` is then the linkage with another value.
 
     Parameters
     ----------
@@ -146,6 +155,9 @@ def planar(
         Of the mechanism.
     cut
         Names of the pins at which loops are cut, instead of those that the spanning tree leaves.
+    parameters
+        Numbers by name, or expressions over the others, as in the table ``[parameters]`` of a
+        description.
 
     Returns
     -------
@@ -187,12 +199,16 @@ def planar(
         "format": 1,
         "name": name,
         "cut": list(name_list(cut, "cut")),
-        PLANAR: {key: _plain(key, value) for key, value in given.items() if value is not None},
+        PLANAR: {
+            key: _plain(f"{PLANAR}.{key}", value)
+            for key, value in given.items()
+            if value is not None
+        },
     }
-    label = f"{name or 'linkage'}.planar"
-    reading = replace(read_tables(entries, label), kind=Linkage)
-    with naming(file=label):
-        return cast(Linkage, assembled(reading))
+    if parameters is not None:
+        entries[PARAMETERS] = _plain(PARAMETERS, _by_name(PARAMETERS, parameters))
+    reading = replace(read_tables(entries, f"{name or 'linkage'}.planar"), kind=Linkage)
+    return cast(Linkage, mechanism_of(reading))
 
 
 def _by_name(argument: str, given: Any) -> Mapping[str, Any]:
@@ -261,14 +277,14 @@ def _plain(key: str, value: Any) -> Any:
     Raises
     ------
     InputError
-        About the key ``planar.key``, if it holds anything else.
+        About ``key``, if it holds anything else.
     """
     try:
         return _tables(value)
     except Exception as error:  # objects may raise anything
         raise InputError(
             f"{safe_repr(value)} does not consist of dictionaries, lists, texts and numbers",
-            element=f"{PLANAR}.{key}",
+            element=key,
             remedy="Give these",
         ) from error
 

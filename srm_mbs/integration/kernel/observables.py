@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
@@ -11,6 +14,7 @@ from srm_mbs._kernel import core
 from srm_mbs._kernel.workspace import LARGE
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.reactions import Reactions, named_reactions
 from srm_mbs.dynamics.constraints.rheonomic import all_rows
 from srm_mbs.dynamics.constraints.row_algebra import INERT, SingularValues, active_rows
 from srm_mbs.dynamics.forces import ForceKinematics
@@ -18,7 +22,7 @@ from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.observables import Observables
 from srm_mbs.integration.kernel.marshalling import force_struct, system_struct
-from srm_mbs.integration.kernel.system import workspace
+from srm_mbs.integration.kernel.system import KEPT, workspace
 from srm_mbs.model.drives import in_order_of_rows
 from srm_mbs.model.mechanism import per_model
 
@@ -38,7 +42,10 @@ def _make_all_rows(mechanism: Mechanism) -> Any:
     return core.System(mechanism.model, system_struct(constants), None)  # type: ignore[union-attr]
 
 
-_all_rows_of_model = per_model(_make_all_rows)
+@per_model
+def _idle_all_rows(mechanism: Mechanism) -> deque[Any]:
+    """Those of :func:`_make_all_rows` that nobody uses."""
+    return deque(maxlen=KEPT)
 
 
 class CompiledObservables(Observables):
@@ -47,26 +54,45 @@ class CompiledObservables(Observables):
     _separated: tuple[ClosureGeometry, tuple[Any, Any, int] | None] | None = None
 
     @cached_property
-    def _kernel(self) -> Any:
+    def _idle(self) -> deque[Any]:
         mechanism = self.mechanism
         # Drives start where the mechanism does, and results of large ones hold their workspace.
         if mechanism.drives or mechanism.model.nv > LARGE:
-            return _make_all_rows(mechanism)
-        return _all_rows_of_model(mechanism)
+            return deque(maxlen=1)
+        return _idle_all_rows(mechanism)
+
+    @contextmanager
+    def _all_rows(self) -> Iterator[Any]:
+        """A kernel system of :func:`_make_all_rows` for one user."""
+        try:
+            kernel_system = self._idle.pop()  # two threads never get the same
+        except IndexError:
+            kernel_system = _make_all_rows(self.mechanism)
+        try:
+            yield kernel_system
+        finally:
+            self._idle.append(kernel_system)
+
+    @property
+    def _calls_python(self) -> bool:
+        """Whether functions of the user act, or forces that a sampled controller held."""
+        system = self.system
+        return system.controlled or system.has_user_forces or system.held is not None
 
     def closure_errors(
         self, t: FloatArray, q: FloatArray, v: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         try:
-            return self._kernel.closure_errors(*_states(t, q, v))  # type: ignore[no-any-return]
+            with self._all_rows() as kernel_system:
+                return kernel_system.closure_errors(*_states(t, q, v))  # type: ignore[no-any-return]
         except ArithmeticError:
             return super().closure_errors(t, q, v)  # raises the error that says why
 
     def jacobians(self, t: FloatArray, q: FloatArray) -> FloatArray:
+        times, places = np.ascontiguousarray(t, dtype=float), np.ascontiguousarray(q)
         try:
-            return self._kernel.jacobians(  # type: ignore[no-any-return]
-                np.ascontiguousarray(t, dtype=float), np.ascontiguousarray(q)
-            )
+            with self._all_rows() as kernel_system:
+                return kernel_system.jacobians(times, places)  # type: ignore[no-any-return]
         except ArithmeticError:
             return super().jacobians(t, q)
 
@@ -91,23 +117,48 @@ class CompiledObservables(Observables):
             return super().smallest_values(geometry, values, k, t, q)
         rows, algebra, _ = prepared
         times, places = np.ascontiguousarray(t, dtype=float), np.ascontiguousarray(q)
-        found: FloatArray = self._kernel.smallest_values(rows, algebra, times, places)
+        with self._all_rows() as kernel_system:
+            found: FloatArray = kernel_system.smallest_values(rows, algebra, times, places)
         others = np.isnan(found)  # other rows are active there
         if others.any():
             found[others] = super().smallest_values(geometry, values, k, t[others], q[others])
         return found
 
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
-        return self._kernel.energies(np.hstack([q, v]))  # type: ignore[no-any-return]
+        with self._all_rows() as kernel_system:
+            return kernel_system.energies(np.hstack([q, v]))  # type: ignore[no-any-return]
+
+    def reactions(self, t: FloatArray, q: FloatArray, v: FloatArray) -> Reactions:
+        """As the reference, by one evaluation of each state; the reference itself where functions
+        of the user act."""
+        system = self.system
+        if self._calls_python:
+            return super().reactions(t, q, v)
+        try:
+            with workspace(system) as kernel_system, self._all_rows() as all_rows_system:
+                lam, on_b, joints = kernel_system.reactions(
+                    all_rows_system, self.mechanism.structure.row_scale, *_states(t, q, v)
+                )
+        except ArithmeticError:
+            return super().reactions(t, q, v)  # raises the error that says why
+        return named_reactions(self.mechanism, lam, np.moveaxis(on_b, 1, 0), joints)
+
+    def accelerations(self, t: FloatArray, q: FloatArray, v: FloatArray) -> FloatArray:
+        if self._calls_python:
+            return super().accelerations(t, q, v)
+        try:
+            with workspace(self.system) as kernel_system:
+                return kernel_system.accelerations(*_states(t, q, v))  # type: ignore[no-any-return]
+        except ArithmeticError:
+            return super().accelerations(t, q, v)  # raises the error that says why
 
     def drive_forces(self, t: FloatArray, q: FloatArray, v: FloatArray) -> dict[str, FloatArray]:
         """As the reference, from the factorisation of each state; the reference itself for states
         at which rows depend on each other, and where functions of the user act."""
-        system = self.system
-        if system.controlled or system.has_user_forces or system.held is not None:
+        if self._calls_python:
             return super().drive_forces(t, q, v)
         try:
-            with workspace(system) as kernel_system:
+            with workspace(self.system) as kernel_system:
                 forces: FloatArray = kernel_system.drive_forces(*_states(t, q, v))
         except ArithmeticError:
             return super().drive_forces(t, q, v)  # raises the error that says why
@@ -133,7 +184,8 @@ class CompiledObservables(Observables):
         if compiled:
             structs = [force_struct(**own[name][0]) for name in compiled]
             try:
-                found = self._kernel.powers(*_states(t, q, v), structs, resting)
+                with self._all_rows() as kernel_system:
+                    found = kernel_system.powers(*_states(t, q, v), structs, resting)
             except ArithmeticError:
                 return super()._powers(elements, t, q, v, resting)
             powers |= dict(zip(compiled, found.T))

@@ -7,7 +7,7 @@ visuals is drawn as bars between its joints and loop anchors.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError, get_logger
+from srm_mbs.errors import InputError, get_logger, joined_names
 from srm_mbs.formats.meshes import read_mesh
 from srm_mbs.formats.xml import parse_numbers, parse_xml
 from srm_mbs.model.closures import LoopClosure
@@ -134,24 +134,54 @@ def visuals_of(
         Closures with their active intervals: bars end at their anchors, which are marked.  Those
         of ``mechanism`` by default.
 
-    Mesh files are searched where :class:`~srm_mbs.model.reach.Reach` says; one that cannot be read
-    is left out with a warning.
+    Mesh files are searched where :class:`~srm_mbs.model.reach.Reach` says.  Those that cannot be
+    read are left out, with one warning; bars stand for bodies that have no other visual.
     """
-    found = list(_urdf_visuals(mechanism))
-    if found:
-        return found
-    return _skeleton(
-        mechanism, [(loop, None) for loop in mechanism.loops] if loops is None else loops
-    )
+    loops = [(loop, None) for loop in mechanism.loops] if loops is None else loops
+    found, left_out = _urdf_visuals(mechanism)
+    if not found:
+        bars = _skeleton(mechanism, loops, set(range(mechanism.model.njoints)))
+    else:
+        drawn = {visual.joint for visual in found}
+        bare = {fault.joint for fault in left_out} - drawn
+        bars = _skeleton(mechanism, loops, bare) if bare else []
+    if left_out and mechanism.source is not None:
+        log.warning("%s", _left_out_text(left_out, len(found), mechanism.source))
+    return [*found, *bars]
 
 
 # The URDF -----------------------------------------------------------------------------------
 
 
-def _urdf_visuals(mechanism: Mechanism) -> Iterator[Visual]:
+@dataclass(frozen=True)
+class _LeftOut:
+    """A ``<visual>`` of ``link``, on ``joint``, that cannot be drawn, and why."""
+
+    link: str
+    joint: int
+    why: InputError
+
+
+def _left_out_text(left_out: Sequence[_LeftOut], drawn: int, source: Source) -> str:
+    """The warning about visuals that are left out, with the folders that were searched."""
+    links = dict.fromkeys(fault.link for fault in left_out)
+    first = left_out[0].why
+    folders = source.reach.searched(Path(source.urdf_path).parent)
+    several = "" if len(left_out) == 1 else ", the first"
+    return (
+        f"{len(left_out)} of {len(left_out) + drawn} visuals are not drawn, of the links "
+        f"{joined_names(map(repr, links))}{several}: {first.problem}. {first.remedy}. Searched in "
+        f"{joined_names(map(str, folders))}; give other folders with mesh_dirs= (--mesh-dirs)"
+    )
+
+
+def _urdf_visuals(mechanism: Mechanism) -> tuple[list[Visual], list[_LeftOut]]:
+    """The visuals of the URDF, and those that cannot be drawn."""
     source, model = mechanism.source, mechanism.model
+    found: list[Visual] = []
+    left_out: list[_LeftOut] = []
     if source is None:
-        return
+        return found, left_out
     root = parse_xml(source.urdf, source.urdf_path)
     # A colour may be defined anywhere, and be used by its name anywhere else.
     colours: dict[str, Element] = {}
@@ -160,18 +190,21 @@ def _urdf_visuals(mechanism: Mechanism) -> Iterator[Visual]:
             colours.setdefault(material.get("name", ""), colour)
     for link in root.findall("link"):
         for element in link.findall("visual"):
-            name = link.get("name")
+            name = link.get("name", "")
             frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
             joint = int(frame.parentJoint)
             try:
-                yield Visual(
+                visual = Visual(
                     joint,
                     frame.placement * _origin(element),
                     _shape(element, source),
                     _colour(element, colours) or _default_colour(joint),
                 )
             except InputError as error:
-                log.warning("link %r is drawn without one of its visuals: %s", name, error)
+                left_out.append(_LeftOut(name, joint, error))
+            else:
+                found.append(visual)
+    return found, left_out
 
 
 def _numbers(element: Element, key: str, default: str) -> list[float]:
@@ -257,15 +290,17 @@ def _mesh(name: str, scale: FloatArray, source: Source) -> Mesh:
 
 
 def _skeleton(
-    mechanism: Mechanism, loops: Sequence[tuple[LoopClosure, ActiveIntervals | None]]
+    mechanism: Mechanism,
+    loops: Sequence[tuple[LoopClosure, ActiveIntervals | None]],
+    joints: Collection[int],
 ) -> list[Visual]:
-    """Bars from each joint to its child joints and loop anchors, with markers there."""
+    """Bars from each of ``joints`` to its child joints and loop anchors, with markers there."""
     ends, masses = bar_ends(mechanism, [loop for loop, _ in loops])
     model = mechanism.model
     anchors = [(*side.resolve(model), active) for loop, active in loops for side in loop.anchors]
     width = BAR_THICKNESS * _extent(mechanism, ends)
     out = []
-    for joint in range(1, model.njoints):
+    for joint in sorted(set(joints) - {0}):
         colour = _default_colour(joint)
         # Bars of a planar mechanism cross in one plane: unequal ones do not flicker there.
         thick = width * (1.0 - 0.08 * (joint % 3))
@@ -275,14 +310,14 @@ def _skeleton(
                 bar = Box((thick, thick, length))
                 out.append(Visual(joint, _along(0.5 * end, end), bar, colour))
         out.append(_marker(mechanism, joint, width))
-    for joint in masses:
+    for joint in sorted(set(joints).intersection(masses)):
         centre = pin.SE3(np.eye(3), model.inertias[joint].lever)
         colour = _default_colour(joint)
         out.append(Visual(joint, centre, Sphere(1.5 * width), colour))
     for joint, placement, active in anchors:
-        if joint:
+        if joint and joint in joints:
             out.append(Visual(joint, placement, Sphere(0.9 * width), ANCHOR_COLOUR, active))
-    for end in ends[0]:
+    for end in ends[0] if 0 in joints else ():
         block = Box((2.0 * width,) * 3)
         out.append(Visual(0, pin.SE3(np.eye(3), end), block, GROUND_COLOUR))
     return out

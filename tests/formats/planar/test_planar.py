@@ -320,6 +320,71 @@ def test_a_description_of_points_and_bars_is_converted(name: str, tmp_path: Path
     np.testing.assert_array_equal(again.q0, linkage.q0)
 
 
+def with_parameters(crank: float, **changes: Any) -> srm.Linkage:
+    """The four-bar with expressions in every kind of argument."""
+    return made(
+        points=POINTS | {"A": ("=crank", 0), "B": ("=3*crank", "=2*crank")},
+        parameters={"crank": crank, "light": "=crank/400"},
+        mass_per_length="=10*light",
+        masses={"coupler": "=light"},
+        start={"O": "=light"},
+        rates={"O": "=crank"},
+        springs=[{"a": "A", "b": "C", "stiffness": "=crank", "rest_length": "=2*crank"}],
+        torques={"C": "=-light"},
+        loads={"B": (0, "=-crank")},
+        gravity=(0, "=-245.25*light"),
+        **changes,
+    )
+
+
+def typed_in(crank: float) -> srm.Linkage:
+    """The same with numbers."""
+    light = crank / 400
+    return made(
+        points=POINTS | {"A": (crank, 0), "B": (3 * crank, 2 * crank)},
+        mass_per_length=10 * light,
+        masses={"coupler": light},
+        start={"O": light},
+        rates={"O": crank},
+        springs=[{"a": "A", "b": "C", "stiffness": crank, "rest_length": 2 * crank}],
+        torques={"C": -light},
+        loads={"B": (0, -crank)},
+        gravity=(0, -245.25 * light),
+    )
+
+
+def assert_same(one: srm.Mechanism, other: srm.Mechanism) -> None:
+    assert one.model == other.model
+    assert (one.loops, one.forces) == (other.loops, other.forces)
+    assert (one.drives, one.points) == (other.drives, other.points)
+    np.testing.assert_array_equal(one.q0, other.q0)
+    np.testing.assert_array_equal(one.v0, other.v0)
+
+
+def test_expressions_over_parameters_stand_for_their_numbers(tmp_path: Path) -> None:
+    linkage = with_parameters(40.0)
+    assert dict(linkage.parameters) == {"crank": 40.0, "light": 0.1}
+    assert_same(linkage, typed_in(40.0))
+    copied = pickle.loads(pickle.dumps(linkage))
+    for origin in (linkage, copied):
+        longer = origin.with_parameters(crank=42.0)
+        assert type(longer) is srm.Linkage
+        assert_same(longer, typed_in(42.0))
+    longer.save(tmp_path / "longer.toml")
+    assert_same(srm.load(tmp_path / "longer.toml"), longer)
+    assert made(lengths={("A", "B"): "=110 + pi"}).parameters == {}
+
+
+def test_a_sweep_varies_the_parameters_of_a_linkage_typed_in() -> None:
+    linkage = with_parameters(40.0)
+    lengths = [39.0, 41.0]
+    found = srm.sweep(linkage, None, 0.05, parameters={"crank": lengths})
+    for energy, crank in zip(found.table["energy_change"], lengths):
+        run = srm.simulate(typed_in(crank), 0.05)
+        ends = run.at(run.span).energy
+        assert energy == pytest.approx(ends[1] - ends[0], rel=1e-9)
+
+
 def test_points_are_saved_with_runs(tmp_path: Path) -> None:
     linkage = made()
     finished(linkage, 0.1).save(tmp_path / "run.npz")
@@ -425,6 +490,10 @@ def refusals() -> dict[str, Callable[[], object]]:
         ),
         "unknown joint to cut": case(cut=["X"]),
         "gravity of three numbers": case(gravity=(0.0, 0.0, -9.81)),
+        "unknown parameter": case(masses={"coupler": "=light"}, parameters={"crank": 1.0}),
+        "parameters as a list": case(parameters=["crank"]),
+        "an expression that is none": case(mass_per_length="=2*"),
+        "a value that nothing uses": lambda: with_parameters(40.0).with_parameters(rod=1.0),
     }
 
 

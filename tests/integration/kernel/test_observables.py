@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -222,8 +223,10 @@ def test_rows_of_another_system_are_refused() -> None:
         geometry, values, mechanism.structure.rank, np.zeros(1), mechanism.q0[None]
     )
     rows, algebra, _ = compiled._separated[1]  # type: ignore[index]
-    kernel_system = both(other)[0]._kernel  # type: ignore[attr-defined]
-    with pytest.raises(ValueError, match="not those of the system"):
+    with (
+        both(other)[0]._all_rows() as kernel_system,  # type: ignore[attr-defined]
+        pytest.raises(ValueError, match="not those of the system"),
+    ):
         kernel_system.smallest_values(rows, algebra, np.zeros(1), other.q0[None])
 
 
@@ -263,3 +266,59 @@ def test_forces_of_drives_beside_dependent_rows_are_those_of_the_reference() -> 
     expected = reference.drive_forces(run.t, run.q, run.v)[drive.name]
     assert np.abs(expected).max() > 0.0
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-11 * np.abs(expected).max())
+
+
+def assert_same_reactions(mechanism: srm.Mechanism, tolerance: float = 1e-9) -> None:
+    """Compare the reactions along a run, relative to the largest one."""
+    run = srm.simulate(mechanism, 0.005)
+    compiled, reference = (each.reactions(run.t, run.q, run.v) for each in both(mechanism))
+    for key in ("closures", "multipliers", "drives", "joints"):
+        found, expected = getattr(compiled, key), getattr(reference, key)
+        assert list(found) == list(expected)
+        size = max((np.abs(own).max(initial=0.0) for own in expected.values()), default=0.0)
+        for name, own in expected.items():
+            assert found[name].shape == own.shape
+            np.testing.assert_allclose(found[name], own, rtol=0.0, atol=tolerance * size)
+    a, b = (each.accelerations(run.t, run.q, run.v) for each in both(mechanism))
+    np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-10 * np.abs(b).max())
+
+
+@pytest.mark.parametrize("name", [*srm.bundled_models(), "n_four_bar_12"])
+def test_reactions_are_those_of_the_reference(name: str) -> None:
+    assert_same_reactions(load(name))
+
+
+@pytest.mark.parametrize("kind", ["springs with damping", "a bushing", "loads"])
+def test_reactions_under_forces_between_links_are_those_of_the_reference(kind: str) -> None:
+    elements = tuple(e for e in ELEMENTS[kind] if not isinstance(e, srm.UserForce))
+    assert_same_reactions(dataclasses.replace(load("four_bar"), forces=elements))
+
+
+def test_reactions_of_redundant_hinges_are_those_of_the_reference() -> None:
+    """Their axis rows depend on the others: the values of least norm."""
+    ball = load("four_bar")
+    hinges = tuple(
+        dataclasses.replace(p, type="revolute", axis=(0.0, 1.0, 0.0)) for p in ball.loops
+    )
+    assert_same_reactions(dataclasses.replace(ball, loops=hinges))
+    assert_same_reactions(
+        dataclasses.replace(
+            ball, loops=(*hinges, *(dataclasses.replace(p, name=f"again {p.name}") for p in hinges))
+        )
+    )
+    assert_same_reactions(driven("five_bar", FIVE_BAR))
+
+
+def test_reactions_with_functions_of_the_user_are_those_of_the_reference() -> None:
+    mechanism = dataclasses.replace(load("four_bar"), forces=ELEMENTS["loads"])
+    assert_same_reactions(mechanism, 1e-14)
+
+
+def test_threads_read_the_reactions_of_one_mechanism_alike() -> None:
+    mechanism = load("four_bar")
+    runs = [srm.simulate(mechanism, 1.0) for _ in range(8)]
+    with ThreadPoolExecutor(4) as threads:
+        found = list(threads.map(lambda run: run.joint_reactions, runs))
+    for each in found:
+        for name, wrench in each.items():
+            np.testing.assert_array_equal(wrench, found[0][name])

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from srm_mbs.analysis.assembly_modes import AssemblyMode, assembly_modes
     from srm_mbs.analysis.equilibrium import Equilibrium, equilibrium
     from srm_mbs.analysis.inverse_dynamics import InverseDynamics, inverse_dynamics
+    from srm_mbs.analysis.kinematics import kinematics
     from srm_mbs.analysis.linearisation import Linearisation, linearise
     from srm_mbs.analysis.linkage import LinkageReport, linkage_report
     from srm_mbs.analysis.path_following import FollowedPath, follow
@@ -65,7 +66,7 @@ if TYPE_CHECKING:
     from srm_mbs.sweeps.results import Sweep
     from srm_mbs.sweeps.sweep import sweep
     from srm_mbs.sweeps.tasks import standard_measures
-    from srm_mbs.visualization.animation.joint_motion import JointMotion
+    from srm_mbs.visualization.animation.joint_motion import CrankMotion, JointMotion
     from srm_mbs.visualization.animation.live import LiveView
 
 _NAMES = {
@@ -73,6 +74,7 @@ _NAMES = {
     "analysis.assembly_modes": "AssemblyMode assembly_modes",
     "analysis.equilibrium": "Equilibrium equilibrium",
     "analysis.inverse_dynamics": "InverseDynamics inverse_dynamics",
+    "analysis.kinematics": "kinematics",
     "analysis.linkage": "LinkageReport linkage_report",
     "analysis.linearisation": "Linearisation linearise",
     "analysis.path_following": "FollowedPath follow",
@@ -106,7 +108,7 @@ _NAMES = {
     "sweeps.results": "Sweep",
     "sweeps.sweep": "sweep",
     "sweeps.tasks": "standard_measures",
-    "visualization.animation.joint_motion": "JointMotion",
+    "visualization.animation.joint_motion": "CrankMotion JointMotion",
     "visualization.animation.live": "LiveView",
 }
 """Public names of each module."""
@@ -130,6 +132,7 @@ __all__ = [
     "Certificate",
     "ConstantSpeed",
     "CouplingSpring",
+    "CrankMotion",
     "DaeSolution",
     "Drive",
     "EnergyBalance",
@@ -178,6 +181,7 @@ __all__ = [
     "follow",
     "impact",
     "inverse_dynamics",
+    "kinematics",
     "linearise",
     "linkage_report",
     "load",

@@ -224,6 +224,28 @@ class LinkageReport:
         return figure
 
 
+def check_crank(mechanism: Mechanism, crank: str) -> Mechanism:
+    """The mechanism without its drives, if it has one degree of freedom and such a joint.
+
+    Raises
+    ------
+    InputError
+        If there is no joint ``crank`` of one degree of freedom, or the mechanism has another number
+        of degrees of freedom.
+    """
+    check_mechanism(mechanism)
+    mechanism = mechanism.undriven
+    one_degree_joint(mechanism.model, crank, "crank", "Give a joint of one degree of freedom")
+    if mechanism.degrees_of_freedom != 1:
+        raise InputError(
+            f"the mechanism has {mechanism.degrees_of_freedom} degrees of freedom, and its joints "
+            "do not follow from the crank",
+            element="mechanism",
+            remedy="Give one of one degree of freedom",
+        )
+    return mechanism
+
+
 def linkage_report(mechanism: Mechanism, crank: str) -> LinkageReport:
     """Analyse a linkage of one degree of freedom over a turn of its crank.
 
@@ -241,17 +263,8 @@ def linkage_report(mechanism: Mechanism, crank: str) -> LinkageReport:
         If there is no such joint, the mechanism has no loop or another number of degrees of
         freedom, or the way of the crank meets a singular configuration.
     """
-    check_mechanism(mechanism)
-    mechanism = mechanism.undriven
+    mechanism = check_crank(mechanism, crank)
     model = mechanism.model
-    one_degree_joint(model, crank, "crank", "Give a joint of one degree of freedom")
-    if mechanism.degrees_of_freedom != 1:
-        raise InputError(
-            f"the mechanism has {mechanism.degrees_of_freedom} degrees of freedom, and its joints "
-            "do not follow from the crank",
-            element="mechanism",
-            remedy="Give one of one degree of freedom",
-        )
     turning = is_angle(model, crank)
     start = position_of(mechanism, mechanism.q0, crank)
     whole = (
@@ -321,7 +334,7 @@ class _Analysis:
             for name, values in self.joints.items()
             if not self._turns_fully(name, values)
         )
-        angle, lengths = self._loop()
+        angle, lengths = four_bar_of(self.mechanism, self.crank, self.q)
         return LinkageReport(
             self.mechanism,
             self.crank,
@@ -392,56 +405,60 @@ class _Analysis:
         near: FloatArray = follow(self.mechanism, {self.crank: [crank]}, self.q[k]).q[-1]
         return near
 
-    def _loop(self) -> tuple[FloatArray | None, tuple[float, float, float, float] | None]:
-        """Transmission angle (n,), and the lengths of the bars of a four-bar; None for others."""
-        mechanism = self.mechanism
-        model = mechanism.model
-        loops = [loop for loop in mechanism.loops if loop.anchors]
-        if len(loops) != 1 or len(mechanism.loops) != 1 or model.njoints != 4:
-            return None, None
-        placed = Placements.at(model, self._data, self.q)
-        (a, _), (b, inside) = loops[0].resolve(model)
-        pins = {frozenset((a, b)): placed.of(b, inside)[1]}
-        slides: dict[frozenset[int], FloatArray] = {}
-        hinges = []
-        for j in range(1, 4):
-            edge = frozenset((j, int(model.parents[j])))
-            axis = placed.rotation[:, j] @ _axis(model, j)
-            if is_angle(model, model.names[j]):
-                pins[edge] = placed.origin[:, j]
-                hinges.append(axis)
-            else:
-                slides[edge] = axis
-        crank = int(model.getJointId(self.crank))
-        second = [e for e in pins if crank in e and 0 not in e]
-        if model.parents[crank] != 0 or len(second) != 1 or len(pins) + len(slides) != 4:
-            return None, None
-        (coupler,) = second[0] - {crank}
-        third = [e for e in (*pins, *slides) if coupler in e and crank not in e]
-        if len(third) != 1 or 0 in third[0]:
-            return None, None
-        (output,) = third[0] - {coupler}
-        last = frozenset((0, output))
-        normal = hinges[0]
-        if third[0] not in pins or any(
-            np.abs(np.cross(axis, normal)).max() > PARALLEL for axis in hinges
-        ):
-            return None, None
-        ground_pin, A, B = (pins[edge] for edge in (frozenset((0, crank)), second[0], third[0]))
-        rod = _across(B - A, normal)
-        if last in slides:
-            # The angle between the coupler and the normal of the slider's path.
-            along = np.abs(np.einsum("nk,nk->n", rod, slides[last])) / np.linalg.norm(rod, axis=1)
-            return np.arcsin(np.minimum(along, 1.0)), None
-        if last not in pins:
-            return None, None
-        arm = _across(B - pins[last], normal)
-        cosine = np.abs(np.einsum("nk,nk->n", rod, arm))
-        cosine /= np.linalg.norm(rod, axis=1) * np.linalg.norm(arm, axis=1)
-        bars = (_across(A - ground_pin, normal), rod, arm, _across(pins[last] - ground_pin, normal))
-        crank_bar, coupler_bar, output_bar, ground = (float(np.linalg.norm(bar[0])) for bar in bars)
-        lengths = crank_bar, coupler_bar, output_bar, ground
-        return np.arccos(np.minimum(cosine, 1.0)), lengths
+
+def four_bar_of(
+    mechanism: Mechanism, crank: str, q: FloatArray
+) -> tuple[FloatArray | None, tuple[float, float, float, float] | None]:
+    """Transmission angle (n,) rad of a four-bar or slider-crank at q (n, nq), and the lengths (m)
+    of crank, coupler, output and ground of a four-bar; None for others."""
+    model = mechanism.model
+    loops = [loop for loop in mechanism.loops if loop.anchors]
+    if len(loops) != 1 or len(mechanism.loops) != 1 or model.njoints != 4:
+        return None, None
+    placed = Placements.at(model, workspace(model), q)
+    (a, _), (b, inside) = loops[0].resolve(model)
+    pins = {frozenset((a, b)): placed.of(b, inside)[1]}
+    slides: dict[frozenset[int], FloatArray] = {}
+    hinges = []
+    for j in range(1, 4):
+        edge = frozenset((j, int(model.parents[j])))
+        axis = placed.rotation[:, j] @ _axis(model, j)
+        if is_angle(model, model.names[j]):
+            pins[edge] = placed.origin[:, j]
+            hinges.append(axis)
+        else:
+            slides[edge] = axis
+    driver = int(model.getJointId(crank))
+    second = [e for e in pins if driver in e and 0 not in e]
+    hinged = model.parents[driver] == 0 and frozenset((0, driver)) in pins
+    if not hinged or len(second) != 1 or len(pins) + len(slides) != 4:
+        return None, None
+    (coupler,) = second[0] - {driver}
+    third = [e for e in (*pins, *slides) if coupler in e and driver not in e]
+    if len(third) != 1 or 0 in third[0]:
+        return None, None
+    (output,) = third[0] - {coupler}
+    last = frozenset((0, output))
+    normal = hinges[0]
+    if third[0] not in pins or any(
+        np.abs(np.cross(axis, normal)).max() > PARALLEL for axis in hinges
+    ):
+        return None, None
+    ground_pin, A, B = (pins[edge] for edge in (frozenset((0, driver)), second[0], third[0]))
+    rod = _across(B - A, normal)
+    if last in slides:
+        # The angle between the coupler and the normal of the slider's path.
+        along = np.abs(np.einsum("nk,nk->n", rod, slides[last])) / np.linalg.norm(rod, axis=1)
+        return np.arcsin(np.minimum(along, 1.0)), None
+    if last not in pins:
+        return None, None
+    arm = _across(B - pins[last], normal)
+    cosine = np.abs(np.einsum("nk,nk->n", rod, arm))
+    cosine /= np.linalg.norm(rod, axis=1) * np.linalg.norm(arm, axis=1)
+    bars = (_across(A - ground_pin, normal), rod, arm, _across(pins[last] - ground_pin, normal))
+    crank_bar, coupler_bar, output_bar, ground = (float(np.linalg.norm(bar[0])) for bar in bars)
+    lengths = crank_bar, coupler_bar, output_bar, ground
+    return np.arccos(np.minimum(cosine, 1.0)), lengths
 
 
 def _axis(model: pin.Model, joint: int) -> FloatArray:

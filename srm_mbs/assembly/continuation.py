@@ -13,7 +13,7 @@ the closures lose rank, branches cross; the path continues along its tangent.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,7 +85,7 @@ class Drag:
 
 
 @dataclass(frozen=True, eq=False)
-class _Point:
+class Waypoint:
     """Configuration (nq,), dragged coordinates (n,) in units, and parameter."""
 
     q: FloatArray
@@ -93,7 +93,7 @@ class _Point:
     s: float
 
 
-_Moved = tuple[_Point, FloatArray]
+_Moved = tuple[Waypoint, FloatArray]
 """A point, and its motion (nv + 1,) from where Newton's iteration began."""
 
 
@@ -107,7 +107,7 @@ class _Follower:
         nv = problem.model.nv
         self.free = np.setdiff1d(np.arange(nv), columns)
         self.selection = np.eye(nv)[columns]
-        self.points = [_Point(start, np.zeros(len(columns)), 0.0)]
+        self.points = [Waypoint(start, np.zeros(len(columns)), 0.0)]
         self.tangents: list[FloatArray] = []
         self.cosine = 1.0
 
@@ -133,7 +133,7 @@ class _Follower:
         sense = along[-1] if before is None or len(null) > 1 else along @ before
         return np.asarray(along if sense >= 0.0 else -along)
 
-    def correct(self, guess: _Point, across: FloatArray) -> tuple[_Point, float] | None:
+    def correct(self, guess: Waypoint, across: FloatArray) -> tuple[Waypoint, float] | None:
         """Newton's iteration from ``guess`` in the plane normal to ``across``: the point and how
         far it is from the guess, or None."""
         problem = self.problem
@@ -148,14 +148,14 @@ class _Follower:
                 right = np.concatenate([g, miss, [across @ moved]])
                 step = np.linalg.lstsq(system, right, rcond=RANK_TOLERANCE)[0]
                 q = problem.move(point.q, -step[:-1])
-                return _Point(q, point.h - step[self.columns], point.s - step[-1]), moved - step
+                return Waypoint(q, point.h - step[self.columns], point.s - step[-1]), moved - step
 
             return max(np.abs(g).max(), np.abs(miss).max(initial=0.0)), next_point
 
         (best, moved), error = newton((guess, np.zeros(len(across))), linearise, ITERATIONS)
         return (best, float(np.linalg.norm(moved))) if error <= CONSTRAINT_TOLERANCE else None
 
-    def advance(self, length: float, end: float) -> tuple[_Point, float] | None:
+    def advance(self, length: float, end: float) -> tuple[Waypoint, float] | None:
         """A step of ``length`` along the tangent, or less to s = end; its point and correction."""
         here, along = self.points[-1], self.tangents[-1]
         fixed = along[-1] > 0.0 and here.s + length * along[-1] >= end
@@ -164,7 +164,7 @@ class _Follower:
             length = (end - here.s) / along[-1]
             across = np.eye(len(along))[-1]
         move = length * along
-        guess = _Point(
+        guess = Waypoint(
             self.problem.move(here.q, move[:-1]),
             here.h + move[self.columns],
             end if fixed else here.s + move[-1],
@@ -175,7 +175,7 @@ class _Follower:
             return None if found is None or found[0].s > end else found
         point, correction = found
         sharp = onto_singular_point(self.problem, point.q, self.free)
-        return _Point(sharp, point.h, end), correction
+        return Waypoint(sharp, point.h, end), correction
 
     def run(self, end: float) -> bool:
         """Follow the path to s = end; False if it turns back before, or ends."""
@@ -249,7 +249,7 @@ def drag(
         turned,
         complete,
         follower.cosine,
-        _met(problem, path, columns, rank),
+        singular_on(problem, path, columns, rank),
     )
 
 
@@ -262,10 +262,10 @@ def _carried(tangent: FloatArray, old: FloatArray, new: FloatArray) -> FloatArra
     return np.asarray(out / np.linalg.norm(out))
 
 
-def _met(
-    problem: ClosureProblem, path: list[_Point], columns: IndexArray, rank: int
+def singular_on(
+    problem: ClosureProblem, path: Sequence[Waypoint], columns: IndexArray, rank: int
 ) -> tuple[Met, ...]:
-    """Singular configurations next to the minima of the last structural singular value."""
+    """Singular configurations on a path: next to minima of the last structural singular value."""
     sizes = np.array([smallest_singular_value(problem, point.q, rank) for point in path])
     padded = np.concatenate([[np.inf], sizes, [np.inf]])
     found: list[Met] = []

@@ -22,6 +22,7 @@ from srm_mbs.cli.output import (
     several,
     table,
 )
+from srm_mbs.cli.playback import Trace, given_points
 from srm_mbs.errors import InputError
 
 if TYPE_CHECKING:
@@ -200,17 +201,40 @@ def linkage(
     plot: Annotated[
         Path | None, option("FILE", "Draw the report over the crank as .png, .pdf or .svg.")
     ] = None,
+    kinematics: Annotated[
+        Path | None,
+        option("FILE.html", "Write a page in which the crank is turned by hand."),
+    ] = None,
+    trace: Trace = None,
 ) -> None:
     """Analyse a linkage over a turn of its crank.
 
     Prints limit positions, dead points, strokes and time ratios, and of four-bars and slider-cranks
-    the transmission angle and the Grashof class.
+    the transmission angle and the Grashof class. Where the page of --kinematics passes singular
+    configurations, from where the motion does not follow from the crank, it prints these instead.
     """
+    check_output(kinematics, "--kinematics", HTML_SUFFIXES)
+    if trace and kinematics is None:
+        raise InputError(
+            "it is drawn in the page, and none is asked for",
+            element="--trace",
+            remedy="Give --kinematics too",
+        )
     if plot is not None:
         from srm_mbs.visualization.plotting.figure import FORMATS
 
         check_output(plot, "--plot", FORMATS)
-    found = srm_mbs.linkage_report(file.load(), crank)
+    mechanism = file.load()
+    motion = None
+    if kinematics is not None:
+        points = given_points(trace or [], "--trace")
+        motion = srm_mbs.kinematics(mechanism, crank)
+        motion.export_html(kinematics, trace=points)
+        say_written(kinematics)
+        if motion.singular_positions and plot is None:
+            table(motion.rows())
+            return
+    found = srm_mbs.linkage_report(mechanism, crank)
     table(found.rows())
     if plot is not None:
         found.plot(plot)

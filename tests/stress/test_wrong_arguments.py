@@ -94,7 +94,14 @@ def test_wrong_arguments_are_refused_with_an_error_of_the_package(
 
 def test_every_public_function_is_called(tmp_path: Path) -> None:
     results = {  # made by the package only
-        *("Assembly", "AssemblyMode", "ButcherTableau", "Certificate", "DaeSolution"),
+        *(
+            "Assembly",
+            "AssemblyMode",
+            "ButcherTableau",
+            "Certificate",
+            "CrankMotion",
+            "DaeSolution",
+        ),
         *("EnergyBalance", "Equilibrium", "FollowedPath", "ForceElement", "InverseDynamics"),
         *(
             "Linearisation",

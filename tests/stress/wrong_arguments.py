@@ -177,6 +177,7 @@ def calls(folder: Path) -> dict[str, Call]:
         "equilibrium": Call(
             srm.equilibrium, (four_bar, {}), {"hold": [crank], "search": "nearest"}
         ),
+        "kinematics": Call(srm.kinematics, (four_bar, crank)),
         "linkage_report": Call(srm.linkage_report, (four_bar, crank)),
         "linearise": Call(
             srm.linearise,

@@ -71,6 +71,17 @@ BODIES = """t => {
 }"""
 
 
+POINT_OF = """([node, at]) => {
+  viewer.render();
+  viewer.scene.updateMatrixWorld(true);
+  const place = new MeshCat.THREE.Vector3(...at).applyMatrix4(
+    viewer.scene_tree.find(["mechanism", node]).object.matrixWorld).project(viewer.camera);
+  const box = pane.getBoundingClientRect();
+  return [box.left + 0.5 * (1 + place.x) * box.width, box.top + 0.5 * (1 - place.y) * box.height];
+}"""
+"""Where a point of a body is seen in the window (pixels)."""
+
+
 def bodies_in(page: Any, t: float | None = None) -> dict[str, Any]:
     """Placement (4, 4) of each body in a page or frame, at the animation's time ``t``."""
     found = page.evaluate(BODIES, t)

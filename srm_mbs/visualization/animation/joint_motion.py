@@ -20,6 +20,7 @@ from srm_mbs.formats.files import checked_path
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.numbers import finite_array
 from srm_mbs.simulation.monitoring import Counted
+from srm_mbs.visualization.animation.crank_motion import CrankPositions
 from srm_mbs.visualization.animation.trajectory import DrawableMotion
 
 if TYPE_CHECKING:
@@ -301,3 +302,36 @@ class JointMotion(AnimationMixin):
             q[i] = pin.integrate(model, self.q[k], (time - self.t[k]) / h * move)
             v[i] = move / h
         return (q[0], v[0]) if np.ndim(t) == 0 else (q, v)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CrankMotion(CrankPositions, JointMotion):
+    """All closed configurations of one branch, in order: the result of
+    :func:`srm_mbs.kinematics`.
+
+    A crank that turns fully passes them at a constant rate, from 0 rad on; another one goes back
+    and forth between its dead points.  The page of such a motion has a slider for the crank in
+    place of the time, and its bodies can be dragged.
+
+    Attributes
+    ----------
+    mechanism, t, q
+        As of a :class:`JointMotion`.
+    crank
+        Name of the joint.
+    positions : (n,)
+        Its positions, rad or m.
+    rates : (n, nv)
+        dq/dq_crank: rates of all coordinates for a unit rate of the crank; large next to its dead
+        points.
+    start
+        Time (s) of the initial configuration of the mechanism.
+    turns
+        Whether the crank turns fully.
+    closed
+        Whether the last configuration is the first one: the motion may be repeated without a jump.
+    marks
+        Dead points and singular configurations, in order.
+    transmission_angle : (n,) rad
+        Of a four-bar or slider-crank; None for others.
+    """

@@ -17,11 +17,12 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.scaling import row_dimensions
+from srm_mbs.dynamics.scaling import is_angle, row_dimensions
 from srm_mbs.errors import CHECK_WRITING, InputError, get_logger
 from srm_mbs.formats.files import write_bytes
 from srm_mbs.integration.singular_passages import Crossing
 from srm_mbs.simulation.result import SimulationResult
+from srm_mbs.visualization.animation.crank_motion import CrankMark, CrankPositions
 from srm_mbs.visualization.animation.meshcat_scene import (
     BACKGROUNDS,
     import_meshcat,
@@ -46,12 +47,16 @@ MAX_JOINT_NUMBERS = 24_000
 """Positions and rates of all joints together: some 200 kB in a page."""
 FEWEST_JOINT_SAMPLES = 50
 """Times of the positions and rates of mechanisms of very many joints."""
-SCRIPTS = ("page.js", "arrows.js", "bodies.js", "curves.js", "passages.js", "ground.js")
+SCRIPTS = (
+    *("page.js", "arrows.js", "bodies.js", "crank.js", "curves.js", "passages.js", "ground.js"),
+)
 """Files of :data:`FOLDER` that are the script of the page, in this order."""
 GROUND_GAP = 2e-3
 """Distance of the ground from the lowest point of the motion, over the height of the picture."""
 NAMED_LOOPS, NAMED_PASSAGES = 12, 100
 """Numbers of loops and of passages up to which the passages name their loops."""
+CRANK_STEPS = 360
+"""Steps of the arrow keys in a motion back and forth of a crank; of a turn they are degrees."""
 DRIFT, ENERGY = "drift |g|", "energy change"
 FLOAT32_ARRAY = 0x17
 """Type of an array of single precision in the MessagePack of msgpack-lite, with which meshcat
@@ -75,24 +80,31 @@ def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -
     Returns
     -------
     dict
-        Those of :func:`values_over_time`, and ``start`` (s), ``panel``, ``notes``, ``arrows``,
-        ``bodies`` with the name of each node that has shapes, ``ground``, ``aspect`` and
-        ``background``.
+        Those of :func:`values_over_time` or :func:`values_over_crank`, and ``start`` (s),
+        ``panel``, ``notes``, ``arrows``, ``bodies`` with the name of each node that has shapes,
+        ``ground``, ``aspect`` and ``background``.
     """
     times = picture.motion.times
     data: dict[str, Any] = {"times": [], "joint_times": [], "values": [], "passages": []}
     if panel and isinstance(motion, SimulationResult):
         data = values_over_time(motion, times)
+    elif panel and isinstance(motion, CrankPositions):
+        data = values_over_crank(motion)
     return data | {
         "start": float(times[0]),
         "panel": panel,
-        "notes": picture.overlays.notes,
+        "notes": picture.overlays.notes + _hint(motion, panel=panel),
         "arrows": _arrows(picture),
         "bodies": _bodies(picture) if panel else [],
         "ground": _ground(picture) if panel else None,
         "aspect": ASPECT,
         "background": BACKGROUNDS,
     }
+
+
+def _hint(motion: DrawableMotion, *, panel: bool) -> list[dict[str, Any]]:
+    by_hand = panel and isinstance(motion, CrankPositions)
+    return [{"text": "drag a body or the slider"}] if by_hand else []
 
 
 def _ground(picture: Picture) -> dict[str, Any] | None:
@@ -158,8 +170,7 @@ def values_over_time(solution: SimulationResult, times: FloatArray) -> dict[str,
     values = []
 
     def add(label: str, unit: str, samples: FloatArray, **more: str) -> None:
-        rounded = [float(f"{x:.{DIGITS}g}") if math.isfinite(x) else None for x in samples.tolist()]
-        values.append({"label": label, "unit": unit, "samples": rounded} | more)
+        values.append({"label": label, "unit": unit, "samples": _rounded(samples)} | more)
 
     with np.errstate(over="ignore", invalid="ignore"):
         if unit:
@@ -184,6 +195,81 @@ def values_over_time(solution: SimulationResult, times: FloatArray) -> dict[str,
         "values": values,
         "passages": passages,
     }
+
+
+def _rounded(samples: FloatArray) -> list[float | None]:
+    return [float(f"{x:.{DIGITS}g}") if math.isfinite(x) else None for x in samples.tolist()]
+
+
+def values_over_crank(motion: CrankPositions) -> dict[str, Any]:
+    """The position of the crank, the transmission angle, and positions and rates of the joints.
+
+    Returns
+    -------
+    dict
+        As :func:`values_over_time`, angles in degrees, and ``crank`` with ``label``, ``unit``,
+        ``samples`` at ``times``, ``start`` (s) of the initial configuration, ``step`` (s) of an
+        arrow key, and whether the motion is ``closed``.
+    """
+    model = motion.mechanism.model
+    names = [name for name in motion.mechanism.joint_names if motion.mechanism.joint(name).nv == 1]
+    numbers = 2 * len(names) * len(motion.t)
+    kept = slice(None, None, math.ceil(numbers / (2 * MAX_JOINT_NUMBERS)))
+    times = motion.t[kept].tolist()
+
+    def in_unit(name: str) -> tuple[str, float]:
+        return ("°", math.degrees(1.0)) if is_angle(model, name) else ("m", 1.0)
+
+    unit, factor = in_unit(motion.crank)
+    values: list[dict[str, Any]] = []
+    if motion.transmission_angle is not None:
+        angle = _rounded(np.degrees(motion.transmission_angle[kept]))
+        values.append({"label": "transmission angle", "unit": "°", "samples": angle})
+    for name, node in zip(motion.mechanism.joint_names, node_names(motion.mechanism)[1:]):
+        if name not in names:
+            continue
+        own, scale = in_unit(name)
+        position, rate = (
+            scale * motion.track(name),
+            motion.rates[:, motion.mechanism.joint(name).idx_v],
+        )
+        values.append(
+            {"label": name, "unit": own, "samples": _rounded(position[kept]), "body": node}
+        )
+        if name != motion.crank:
+            samples = _rounded(rate[kept] * scale / factor)
+            per = f"{own}/{unit}"
+            label = f"{name} per {motion.crank}"
+            values.append({"label": label, "unit": per, "samples": samples, "body": node})
+    # A crank that turns begins at a whole turn, which is written as 0.
+    position = motion.positions - motion.positions[0] if motion.turns else motion.positions
+    turns = round(np.ptp(motion.positions) / (2.0 * np.pi)) if motion.turns else 1
+    return {
+        "times": times,
+        "joint_times": times,
+        "values": values,
+        "passages": [
+            {"time": mark.time, "text": _mark_text(mark, motion, factor, unit)}
+            for mark in motion.marks
+        ],
+        "crank": {
+            "label": motion.crank,
+            "unit": unit,
+            "times": times,
+            "samples": (factor * position[kept]).tolist(),
+            "start": motion.start,
+            "step": float(motion.t[-1]) / (CRANK_STEPS * turns),
+            "closed": motion.closed,
+        },
+    }
+
+
+def _mark_text(mark: CrankMark, motion: CrankPositions, factor: float, unit: str) -> str:
+    position = mark.position - motion.positions[0] * motion.turns
+    at = f"{motion.crank} = {factor * position:.4g}{'' if unit == '°' else ' '}{unit}"
+    if mark.loops:
+        return f"singular configuration at {at}: {', '.join(mark.loops)}"
+    return f"dead point at {at}: {motion.crank} turns back"
 
 
 def _joint_times(mechanism: Mechanism, times: FloatArray) -> FloatArray:

@@ -29,7 +29,7 @@ from srm_mbs.visualization.animation.overlays import (
 from srm_mbs.visualization.animation.page import SCRIPTS, make_page, page_data, values_over_time
 from srm_mbs.visualization.animation.scene import ASPECT, FIELD_OF_VIEW, FILLED_PART, make_picture
 from srm_mbs.visualization.animation.snapshot import draw_snapshot
-from tests.support.browsing import exported, opened, placements
+from tests.support.browsing import POINT_OF, exported, opened, placements
 from tests.support.bundled import load
 from tests.support.commands import run
 from tests.support.mechanisms import floating_ring
@@ -221,17 +221,6 @@ def test_the_controls_are_reached_by_tab_and_have_names_to_be_read_aloud(page: A
         reached.append(page.evaluate("document.activeElement.id"))
         page.keyboard.press("Tab")
     assert reached == ["toggle", "speed", "loop", "time"]
-
-
-POINT_OF = """([node, at]) => {
-  viewer.render();
-  viewer.scene.updateMatrixWorld(true);
-  const place = new MeshCat.THREE.Vector3(...at).applyMatrix4(
-    viewer.scene_tree.find(["mechanism", node]).object.matrixWorld).project(viewer.camera);
-  const box = pane.getBoundingClientRect();
-  return [box.left + 0.5 * (1 + place.x) * box.width, box.top + 0.5 * (1 - place.y) * box.height];
-}"""
-"""Where a point of a body is seen in the window (pixels)."""
 
 
 @pytest.mark.browser

@@ -6,23 +6,25 @@ let chosen = "", hovered = "";
 const body_root = () => viewer.scene_tree.find(["mechanism"]);
 const name_of = (node) => about.bodies.find((body) => body.node === node)?.name ?? "";
 
-// The node of the first body below a point of the window, "" if there is none.
-function body_at(x, y) {
+// The node of the first body below a point of the window, and the point of it in the scene; of none
+// the name is "".
+function body_below(x, y) {
   const box = pane.getBoundingClientRect(), THREE = MeshCat.THREE;
   const point = new THREE.Vector2(
     2 * (x - box.left) / box.width - 1, 1 - 2 * (y - box.top) / box.height);
   const caster = new THREE.Raycaster();
   caster.setFromCamera(point, viewer.camera);
-  for (const { object } of caster.intersectObject(body_root().object, true)) {
+  for (const { object, point: place } of caster.intersectObject(body_root().object, true)) {
     if (!object.isMesh) continue;
     let node = object, seen = true;
     for (; node.parent && node.parent !== body_root().object; node = node.parent) {
       seen &&= node.visible;
     }
-    if (seen && name_of(node.name)) return node.name;
+    if (seen && name_of(node.name)) return { node: node.name, place };
   }
-  return "";
+  return { node: "", place: null };
 }
+const body_at = (x, y) => body_below(x, y).node;
 
 // The chosen body among others that are faint, and the one under the pointer a little brighter.
 function mark_bodies() {

@@ -45,7 +45,7 @@ function add_curve(value) {
   for (const end of ends) add(scale, "span", { textContent: shown(end) });
   const plot = svg(box, "svg", {
     viewBox: `0 0 1000 ${CURVE_HEIGHT}`, preserveAspectRatio: "none", role: "img",
-    "aria-label": `${value.label} over time, from ${shown(ends[1])} to ${shown(ends[0])} ${value.unit}`,
+    "aria-label": `${value.label} over ${about.crank?.label ?? "time"}, from ${shown(ends[1])} to ${shown(ends[0])} ${value.unit}`,
   });
   for (const { time } of about.passages) {
     const x = 1000 * (time - about.start) / animator.duration;

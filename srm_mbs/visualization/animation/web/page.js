@@ -58,7 +58,7 @@ function fill_panel() {
   const notes = element("notes");
   notes.replaceChildren();
   element("name").textContent = document.title;
-  if (about.panel) add_row("t", "s", "t");
+  if (about.panel) add_row(about.crank?.label ?? "t", about.crank?.unit ?? "s", "t");
   for (const value of about.values) {
     if (!value.body) add_row(value.label, value.unit, value);
   }
@@ -155,7 +155,7 @@ slider.oninput = () => seek(+slider.value);
 element("speed").onchange = () => { animator.mixer.timeScale = +element("speed").value; };
 element("loop").onchange = () => {
   for (const action of animator.actions) {
-    if (element("loop").checked) action.setLoop(MeshCat.THREE.LoopRepeat, Infinity);
+    if (element("loop").checked) action.setLoop(repetition(), Infinity);
     else action.setLoop(MeshCat.THREE.LoopOnce, 1);
   }
 };
@@ -165,10 +165,18 @@ function toggle() {
 }
 element("toggle").onclick = toggle;
 
+const step_of_keys = () => about.crank?.step ?? animator.duration / 100;
+// A crank that turns goes on at the end of a turn.
+function inside(time) {
+  const duration = animator.duration, over = time < -1e-9 || time > duration + 1e-9;
+  if (about.crank?.closed && over) return (time + duration) % duration;
+  return Math.min(Math.max(time, 0), duration);
+}
+
 // Keys, wherever the focus is; those that its own element takes are left to it.
 const SEEKS = {
-  ArrowLeft: () => animator.time - animator.duration / 100,
-  ArrowRight: () => animator.time + animator.duration / 100,
+  ArrowLeft: () => animator.time - step_of_keys(),
+  ArrowRight: () => animator.time + step_of_keys(),
   Home: () => 0,
   End: () => animator.duration,
 };
@@ -181,7 +189,7 @@ document.addEventListener("keydown", (event) => {
   if (own && own !== slider && (own.tagName !== "BUTTON" || event.key === " ")) return;
   if (event.key === " ") toggle();
   else if (event.key in SEEKS) {
-    seek(Math.min(Math.max(SEEKS[event.key](), 0), animator.duration));
+    seek(inside(SEEKS[event.key]()));
   } else return;
   event.preventDefault();
 });
@@ -224,13 +232,16 @@ function show() {
   element("toggle").textContent = animator.playing ? "Pause" : "Play";
   // In the time of the run, as in the panel: meshcat's own begins at 0.
   const digits = digits_of(animator.duration), end = about.start + animator.duration;
-  clock.value = `${fixed(about.start + animator.time, digits)} / ${fixed(end, digits)} s`;
+  clock.value = about.crank ? crank_text(animator.time)
+    : `${fixed(about.start + animator.time, digits)} / ${fixed(end, digits)} s`;
   slider.setAttribute("aria-valuetext", clock.value);
   // While a run is computed there is no animation.
   const computed = about.live && animator.duration === 0;
   const time = computed ? state[0] : about.start + animator.time;
   if (scene !== null || animator.duration > 0 || time > 0) step_back();
-  if (about.panel) cells.get("t").textContent = fixed(time, digits + 1);
+  if (about.panel) {
+    cells.get("t").textContent = about.crank ? crank_position(time) : fixed(time, digits + 1);
+  }
   for (const [value, cell] of cells) {
     if (!value.label) continue;
     cell.textContent = shown(computed ? state[value.live] ?? null : value_at(value, time));

@@ -92,9 +92,18 @@ class BalancedRun(Protocol):
     """The part of a :class:`~srm_mbs.simulation.result.SimulationResult` that a balance reads."""
 
     mechanism: Mechanism
-    t: FloatArray
-    q: FloatArray
-    v: FloatArray
+
+    @property
+    def t(self) -> FloatArray:
+        """Times (n,) s."""
+
+    @property
+    def q(self) -> FloatArray:
+        """Configurations (n, nq)."""
+
+    @property
+    def v(self) -> FloatArray:
+        """Velocities (n, nv)."""
 
     @property
     def steps(self) -> StepData:

@@ -151,6 +151,7 @@ def test_without_a_compiler_the_error_says_so(
     with pytest.raises(srm.InputError, match="there is no C compiler") as caught:
         srm.simulate(srm.load("four_bar"), 0.1, backend="generated")
     assert caught.value.remedy.startswith("Install a C compiler")
+    monkeypatch.delenv("SRM_MBS_BACKEND", raising=False)
     assert srm.simulate(srm.load("four_bar"), 0.1).settings.backend == "kernel"
 
 

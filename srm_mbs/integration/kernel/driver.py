@@ -49,16 +49,16 @@ class CompiledRecord(RunRecord):
 
     def close(self) -> None:
         """Let go of the run, which refers to a workspace; its steps remain."""
-        self._suspects, self._records = self.run.suspect_times(), self._taken()
+        self._suspects, self._records = self.run.suspect_times(), self._take_records()
         self.run = None
 
-    def _taken(self) -> Any:
+    def _take_records(self) -> Any:
         start = (self.t0, self.x0) if self.rest is None else self.rest
         return self.run.take_records(*start)
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
-        return steps_from(self._taken() if self.run is not None else self._records, self.stop)
+        return steps_from(self._take_records() if self.run is not None else self._records, self.stop)
 
 
 def integrate(

@@ -869,7 +869,7 @@ class FinishedRun:
         )
 
     def _coordinate_sentences(self) -> str:
-        """What there is to say of the coordinates of the ends of the steps."""
+        """Sentences about the coordinates at the ends of the steps."""
         output = self.output
         if output is not None:
             least, largest, turned = output.least, output.largest, output.over_half_turn

@@ -49,7 +49,7 @@ class CompiledRecord(RunRecord):
 
     def close(self) -> None:
         """Let go of the run, which refers to a workspace; its steps remain."""
-        self._suspects, self._records = self.run.suspect_times(), self._taken()
+        self._suspects, self._records = self.run.suspect_times(), self._take_records()
         self.run = None
 
     def _taken(self) -> Any:
@@ -58,7 +58,7 @@ class CompiledRecord(RunRecord):
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
-        return steps_from(self._taken() if self.run is not None else self._records, self.stop)
+        return steps_from(self._take_records() if self.run is not None else self._records, self.stop)
 
 
 def integrate(

@@ -52,13 +52,14 @@ class CompiledRecord(RunRecord):
         self._suspects, self._records = self.run.suspect_times(), self._take_records()
         self.run = None
 
-    def _taken(self) -> Any:
+    def _take_records(self) -> Any:
         start = (self.t0, self.x0) if self.rest is None else self.rest
         return self.run.take_records(*start)
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
-        return steps_from(self._take_records() if self.run is not None else self._records, self.stop)
+        records = self._records if self.run is None else self._take_records()
+        return steps_from(records, self.stop)
 
 
 def integrate(

@@ -105,8 +105,7 @@ LONGEST_REPEATED = 2.0
 """Longest first step of a segment that continues another, over the length of that one: events come
 as soon again, and a longer step would be read at its beginning only."""
 SHORTEST_REPEATED = 0.1
-"""Shortest first step of a segment that continues another, over the last step of that one: below
-it, the first step is chosen as at the start of a run."""
+"""That step, over the last one, below which the first step is chosen as at the start of a run."""
 STIFF_START = 1e-10
 """First step, over the length of the run, where the start is faster than any step."""
 SMALLER_STEPS = "See solution.crossings; try a smaller rtol or step."
@@ -870,7 +869,7 @@ class FinishedRun:
         )
 
     def _coordinate_sentences(self) -> str:
-        """Sentences on joint limits and bushings, from the ends of the steps."""
+        """Sentences about the coordinates at the ends of the steps."""
         output = self.output
         if output is not None:
             least, largest, turned = output.least, output.largest, output.over_half_turn

@@ -58,7 +58,8 @@ class CompiledRecord(RunRecord):
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
-        return steps_from(self._take_records() if self.run is not None else self._records, self.stop)
+        records = self._records if self.run is None else self._take_records()
+        return steps_from(records, self.stop)
 
 
 def integrate(

@@ -168,9 +168,9 @@ def finite_numbers(
     InputError
         About ``element``, by default ``name``, with that ``remedy``, if they are anything else.
     """
-    if type(values) in (tuple, list) and len(values) == count:
-        if all(map(_is_finite_float, values)):
-            return tuple(values)
+    plain_list = type(values) in (tuple, list) and len(values) == count
+    if plain_list and all(map(_is_finite_float, values)):
+        return tuple(values)
     array = finite_array(values, (count,))
     if array is None:
         raise InputError(

@@ -53,6 +53,8 @@ GROUND_GAP = 2e-3
 NAMED_LOOPS, NAMED_PASSAGES = 12, 100
 """Numbers of loops and of passages up to which the passages name their loops."""
 DRIFT, ENERGY = "drift |g|", "energy change"
+BETWEEN_STEPS = f"{DRIFT} between steps"
+"""Drift of the dense output, which the page shows: at steps it is smaller."""
 FLOAT32_ARRAY = 0x17
 """Type of an array of single precision in the MessagePack of msgpack-lite, with which meshcat
 reads."""
@@ -163,7 +165,7 @@ def values_over_time(solution: SimulationResult, times: FloatArray) -> dict[str,
 
     with np.errstate(over="ignore", invalid="ignore"):
         if unit:
-            add(DRIFT, unit, run.drift[:, 0])
+            add(BETWEEN_STEPS, unit, run.drift[:, 0])
         add(ENERGY, "J", run.energy - solution.at(times[:1]).energy)
         if unit and solution.steps.count:
             add("sigma", "", sigma_at(solution, times))

@@ -1,7 +1,8 @@
 """Runs per second of a sweep against the number of workers.
 
     python -m benchmarks.sweep_throughput [--seconds 2] [--repeats 3] [--workers 1 2] [--json FILE]
-    python -m benchmarks.sweep_throughput --variants 500 [--repeats 3] [--workers 2] [--json FILE]
+    python -m benchmarks.sweep_throughput --variants 500 [--backend generated] [--repeats 3]
+        [--workers 2] [--json FILE]
 
 Run from a checkout; BLAS runs on one thread.  Initial speeds of a four-bar are swept, with short
 runs and long ones; or, with `--variants`, the crank of Klann's walker: each case makes a variant of
@@ -132,8 +133,8 @@ def with_dask(stack: ExitStack, workers: int) -> Executor:
     return stack.enter_context(Client(cluster)).get_executor()
 
 
-def measure_variants(count: int, repeats: int, workers: list[int]) -> list[Row]:
-    """Throughput of ``count`` variants of Klann's walker."""
+def measure_variants(count: int, repeats: int, workers: list[int], backend: str) -> list[Row]:
+    """Throughput of ``count`` variants of Klann's walker, computed by ``backend``."""
     mechanism = klann()
     cranks = np.linspace(*CRANKS, count)
 
@@ -144,6 +145,7 @@ def measure_variants(count: int, repeats: int, workers: list[int]) -> list[Row]:
             VARIANT_END,
             parameters={"crank": values},
             measure=largest_reactions,
+            backend=backend,
             executor=executor,
             chunk=chunk,
         )
@@ -229,6 +231,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--variants", type=int)
+    parser.add_argument("--backend", default="kernel", help="of the runs of variants")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
@@ -238,7 +241,9 @@ def main() -> None:
     rows = []
     for t_end in (VARIANT_END,) if arguments.variants else LENGTHS:
         for row in (
-            measure_variants(arguments.variants, arguments.repeats, arguments.workers)
+            measure_variants(
+                arguments.variants, arguments.repeats, arguments.workers, arguments.backend
+            )
             if arguments.variants
             else measure(t_end, arguments.seconds, arguments.repeats, arguments.workers)
         ):

@@ -691,7 +691,10 @@ def test_closures_are_drawn_while_they_are_there_and_not_before_or_after(
         end = srm.Anchor("rod", xyz=(2.0, 0.0, 0.0))
         assert np.abs(rope - place(let_go_and_tied, 1.2, end)).max() < 1e-6
         rows = {name: value for name, value, _ in page.evaluate(READ, 0.7)}
-        assert (rows["drift |g| between steps"], rows["sigma"]) == ("0", "\u2013")  # there are no closures
+        assert (rows["drift |g| between steps"], rows["sigma"]) == (
+            "0",
+            "\u2013",
+        )  # there are no closures
         page.evaluate("seek(1.45)")
         page.evaluate("animator.play()")
         page.wait_for_function("animator.time < 0.4")  # over again

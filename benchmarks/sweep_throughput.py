@@ -1,9 +1,13 @@
 """Runs per second of a sweep against the number of workers.
 
     python -m benchmarks.sweep_throughput [--seconds 2] [--repeats 3] [--workers 1 2] [--json FILE]
+    python -m benchmarks.sweep_throughput --variants 500 [--backend generated] [--repeats 3]
+        [--workers 2] [--json FILE]
 
 Run from a checkout; BLAS runs on one thread.  Initial speeds of a four-bar are swept, with short
-runs and long ones; every executor has to give the rows of the serial sweep, to the last bit.
+runs and long ones; or, with `--variants`, the crank of Klann's walker: each case makes a variant of
+the mechanism, simulates 2 s, and measures the reactions of all its joints.  Every executor has to
+give the rows of the serial sweep, to the last bit; of variants, Dask with processes is among them.
 Workers have been started, and have run, before the clock is.  The repeats go through all executors
 in turn, and the best of each counts; `--seconds` is about what one takes serially.  CPU time over
 wall time, of this process, says on a busy machine whether threads run beside each other.
@@ -15,21 +19,31 @@ import argparse
 import json
 import os
 import time
+import tomllib
 from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import tomli_w
 
 import srm_mbs as srm
+from srm_mbs.formats.load import models_folder
 
 LENGTHS = (1.0, 10.0, 60.0)
 """Ends of the runs, s."""
 CHUNK = 8
+VARIANT_CHUNK = 16
+"""Variants that a worker process makes at a time."""
+VARIANT_END = 2.0
+"""End of the runs of variants, s."""
+CRANKS = (0.262, 0.274)
+"""Least and largest crank (m) of the variants of Klann's walker, whose own is 0.268."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +69,27 @@ def cases(mechanism: srm.Mechanism, count: int) -> dict[str, Any]:
     return {
         "q0": np.tile(mechanism.q0, (count, 1)),
         "v0": np.outer(np.linspace(0.5, 1.5, count), mechanism.v0),
+    }
+
+
+def klann() -> srm.Mechanism:
+    """Klann's walker with the length of its crank as a parameter."""
+    tables = tomllib.loads((models_folder() / "klann_walker.toml").read_text(encoding="utf-8"))
+    points = tables["planar"]["points"]
+    x, y = points["O"]
+    tables["parameters"] = {"crank": x - points["A"][0]}
+    points |= {"A": [f"={x!r} - crank", y], "A_r": [f"={x!r} + crank", y]}
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "klann.toml")
+        path.write_text(tomli_w.dumps(tables), encoding="utf-8")
+        return srm.load(path)
+
+
+def largest_reactions(solution: srm.Solution) -> dict[str, float]:
+    """The largest force (N) in each joint."""
+    return {
+        name: float(np.linalg.norm(wrench[:, :3], axis=1).max())
+        for name, wrench in solution.joint_reactions.items()
     }
 
 
@@ -86,6 +121,89 @@ def timed(run: Callable[[], srm.Sweep]) -> tuple[float, float, srm.Sweep]:
     return time.perf_counter() - start, time.process_time() - cpu, sweep
 
 
+def with_dask(stack: ExitStack, workers: int) -> Executor:
+    """Worker processes of Dask, of one thread each."""
+    from distributed import Client, LocalCluster
+
+    cluster = stack.enter_context(
+        LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None
+        )
+    )
+    return stack.enter_context(Client(cluster)).get_executor()
+
+
+def measure_variants(count: int, repeats: int, workers: list[int], backend: str) -> list[Row]:
+    """Throughput of ``count`` variants of Klann's walker, computed by ``backend``."""
+    mechanism = klann()
+    cranks = np.linspace(*CRANKS, count)
+
+    def run(executor: Executor | None, chunk: int, values: Any = cranks) -> srm.Sweep:
+        return srm.sweep(
+            mechanism,
+            None,
+            VARIANT_END,
+            parameters={"crank": values},
+            measure=largest_reactions,
+            backend=backend,
+            executor=executor,
+            chunk=chunk,
+        )
+
+    with ExitStack() as stack:
+        rows: list[tuple[str, int, int, Executor | None]] = [("serial", 1, 1, None)]
+        for number in workers:
+            threads = stack.enter_context(ThreadPoolExecutor(number))
+            processes = ProcessPoolExecutor(number, mp_context=get_context("spawn"))
+            rows += [
+                ("threads", number, 1, threads),
+                ("processes", number, VARIANT_CHUNK, stack.enter_context(processes)),
+                ("dask", number, VARIANT_CHUNK, with_dask(stack, number)),
+            ]
+        reference = run(None, 1)
+        for *_, chunk, executor in rows[1:]:
+            run(executor, chunk, cranks[: 4 * VARIANT_CHUNK])
+        return best_of(
+            rows,
+            VARIANT_END,
+            count,
+            repeats,
+            reference,
+            lambda executor, chunk: run(executor, chunk),
+        )
+
+
+def best_of(
+    rows: list[tuple[str, int, int, Executor | None]],
+    t_end: float,
+    count: int,
+    repeats: int,
+    reference: srm.Sweep,
+    run: Callable[[Executor | None, int], srm.Sweep],
+) -> list[Row]:
+    """The best of the ``repeats`` of each executor, in turn, all with the rows of the reference."""
+    best = [(np.inf, 0.0)] * len(rows)
+    for _ in range(repeats):
+        for k, (name, _, chunk, executor) in enumerate(rows):
+            took, cpu, sweep = timed(lambda e=executor, c=chunk: run(e, c))
+            if not same(sweep, reference):
+                raise SystemExit(f"{name}: the rows differ from those of the serial sweep")
+            best[k] = min(best[k], (took, cpu / took))
+    return [
+        Row(
+            t_end,
+            name,
+            number,
+            chunk,
+            count,
+            count / took,
+            best[0][0] / took,
+            None if name in ("processes", "dask") else busy,
+        )
+        for (name, number, chunk, _), (took, busy) in zip(rows, best)
+    ]
+
+
 def measure(t_end: float, seconds: float, repeats: int, workers: list[int]) -> list[Row]:
     mechanism = srm.load("four_bar")
 
@@ -102,26 +220,9 @@ def measure(t_end: float, seconds: float, repeats: int, workers: list[int]) -> l
         rows = executors(stack, workers)
         for *_, chunk, executor in rows:
             run(4 * CHUNK, executor, chunk)
-        best = [(np.inf, 0.0)] * len(rows)
-        for _ in range(repeats):
-            for k, (name, _, chunk, executor) in enumerate(rows):
-                took, cpu, sweep = timed(lambda e=executor, c=chunk: run(count, e, c))
-                if not same(sweep, reference):
-                    raise SystemExit(f"{name}: the rows differ from those of the serial sweep")
-                best[k] = min(best[k], (took, cpu / took))
-    return [
-        Row(
-            t_end,
-            name,
-            number,
-            chunk,
-            count,
-            count / took,
-            best[0][0] / took,
-            None if name == "processes" else busy,
+        return best_of(
+            rows, t_end, count, repeats, reference, lambda e, chunk: run(count, e, chunk)
         )
-        for (name, number, chunk, _), (took, busy) in zip(rows, best)
-    ]
 
 
 def main() -> None:
@@ -129,6 +230,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--variants", type=int)
+    parser.add_argument("--backend", default="kernel", help="of the runs of variants")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
@@ -136,8 +239,14 @@ def main() -> None:
     print("| run (s) | executor | workers | chunk | cases | runs/s | of serial | CPU / wall |")
     print("|---|---|---|---|---|---|---|---|")
     rows = []
-    for t_end in LENGTHS:
-        for row in measure(t_end, arguments.seconds, arguments.repeats, arguments.workers):
+    for t_end in (VARIANT_END,) if arguments.variants else LENGTHS:
+        for row in (
+            measure_variants(
+                arguments.variants, arguments.repeats, arguments.workers, arguments.backend
+            )
+            if arguments.variants
+            else measure(t_end, arguments.seconds, arguments.repeats, arguments.workers)
+        ):
             rows.append(row)
             busy = "" if row.busy is None else f"{row.busy:.2f}"
             print(

@@ -6,7 +6,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import numpy as np
+import pinocchio as pin
 
+from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.assembly.continuation import CLOSE, drag
 from srm_mbs.assembly.position import ClosureProblem, assemble_positions, beyond_limits
@@ -31,6 +33,54 @@ def _described(loop_residuals: Mapping[str, tuple[float | None, float | None]]) 
     return "; ".join(parts)
 
 
+PARALLEL_TOLERANCE = 1e-6
+"""Sine of the angle between axes that are parallel."""
+CORRECT_AXIS = "Correct the axis of that joint, or the rotation of its place in the parent link"
+HINGES_OF_A_LOOP = 3
+"""Least number of hinges from which the direction of most is known."""
+
+
+def inclined_axes(mechanism: Mechanism) -> dict[str, str]:
+    """Hinges whose axis, with all joints at zero, is inclined to those of the other hinges of a
+    loop, which are parallel: joint -> a clause that says so.
+
+    Loops that may move with axes in any direction are left out: those with more joints than rows,
+    or with joints of several degrees of freedom.
+    """
+    model = mechanism.model
+    data = workspace(model)
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    axes = np.array(data.J).reshape(6, -1)[3:].T
+    found = {}
+    for loop in mechanism.loops:
+        if not loop.anchors:
+            continue
+        a, b = (set(model.supports[joint].tolist()) for joint, _ in loop.resolve(model))
+        joints = sorted(a ^ b)
+        if len(joints) > loop.rows.count or any(model.joints[joint].nv > 1 for joint in joints):
+            continue
+        turning = {joint: axes[model.joints[joint].idx_v] for joint in joints}
+        hinges = [joint for joint, axis in turning.items() if axis.any()]
+        if len(hinges) < HINGES_OF_A_LOOP:
+            continue
+        across = np.linalg.norm(
+            np.cross([[turning[i] for i in hinges]], [[turning[j]] for j in hinges]), axis=2
+        )
+        apart = across > PARALLEL_TOLERANCE
+        odd = np.flatnonzero(apart.sum(axis=1) == len(hinges) - 1)
+        if len(odd) != 1 or np.delete(np.delete(apart, odd, 0), odd, 1).any():
+            continue
+        others = [k for k in range(len(hinges)) if k != odd[0]]
+        angle = np.degrees(np.arcsin(min(across[odd[0], others[0]], 1.0)))
+        name = model.names[hinges[odd[0]]]
+        found[name] = (
+            f"in the loop {loop.name!r} the axis of the joint {name!r} is inclined by "
+            f"{angle:.3g} degrees to those of {quoted(model.names[hinges[k]] for k in others)}, "
+            "which are parallel"
+        )
+    return found
+
+
 def cannot_close(
     mechanism: Mechanism,
     problem: ClosureProblem,
@@ -44,6 +94,14 @@ def cannot_close(
     """
     loop_residuals = problem.loop_residuals(q)
     remaining = f"remaining gaps: {_described(loop_residuals)}"
+    if inclined := inclined_axes(mechanism):
+        return AssemblyError(
+            f"{'; '.join(inclined.values())}: the loops cannot be closed; {remaining}",
+            residuals=loop_residuals,
+            q=q,
+            element=f"joint {next(iter(inclined))!r}",
+            remedy=CORRECT_AXIS,
+        )
     closings = {}
     for name in held:
         others = tuple(other for other in held if other != name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.assembly.assemble import consistent_start
+from srm_mbs.assembly.diagnosis import CORRECT_AXIS, inclined_axes
 from srm_mbs.assembly.implied_rows import without_implied_rows
 from srm_mbs.assembly.position import CONSTRAINT_TOLERANCE, limit_springs
 from srm_mbs.dynamics.constraints.structure import ReusableAnalysis, structure_of
@@ -22,11 +24,13 @@ from srm_mbs.errors import (
     AssemblyError,
     EvaluationError,
     InputError,
+    SrmWarning,
     get_logger,
     known_names,
     naming,
 )
 from srm_mbs.formats.csv_table import CsvFolder
+from srm_mbs.formats.plausibility import doubtful_angles, doubtful_inertias
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
 from srm_mbs.formats.urdf.parser import build_urdf, lock_joints
 from srm_mbs.formats.xml import parse_xml
@@ -390,6 +394,28 @@ def _analysed(mechanism: Mechanism, analysis: ReusableAnalysis | None) -> None:
     _ = mechanism.structure
 
 
+def _with_doubts(mechanism: Mechanism, description: Description) -> Mechanism:
+    """The mechanism with notes about values that look like those of other units, and about an axis
+    that keeps a loop from moving; warnings say the same."""
+    initial = description.initial
+    doubts = [
+        *doubtful_angles(mechanism, "initial.q", initial.q),
+        *doubtful_angles(mechanism, "initial.guess", initial.guess),
+        *doubtful_inertias(mechanism),
+    ]
+    if mechanism.loops and mechanism.degrees_of_freedom == 0 and not mechanism.drives:
+        inclined = inclined_axes(mechanism).values()
+        doubts += [f"the mechanism cannot move: {clause}. {CORRECT_AXIS}" for clause in inclined]
+    if not doubts:
+        return mechanism
+    name = mechanism.name if mechanism.source is None else mechanism.source.path
+    for doubt in doubts:
+        warnings.warn(f"{name}: {doubt}", SrmWarning, stacklevel=2)
+    noted = replace(mechanism, notes=(*mechanism.notes, *doubts))
+    structure_of.keep(noted, mechanism.structure)
+    return noted
+
+
 def assembled(reading: Reading) -> Mechanism:
     """The mechanism with its loops closed.
 
@@ -425,6 +451,7 @@ def assembled(reading: Reading) -> Mechanism:
         )
     if reading.check is not None:
         reading.check(mechanism)
+    mechanism = _with_doubts(mechanism, description)
     log.info(
         "%s: %d degrees of freedom, rank %d",
         mechanism.name,

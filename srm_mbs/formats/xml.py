@@ -59,7 +59,8 @@ NAMESPACED = re.compile(r"\{[^}]*\}")
 
 def local_name(node: Element) -> str:
     """The tag without its namespace."""
-    return node.tag.rsplit("}", 1)[-1].rsplit(":", 1)[-1]
+    tag = node.tag
+    return tag.rsplit("}", 1)[-1].rsplit(":", 1)[-1] if ":" in tag or "}" in tag else tag
 
 
 def parse_numbers(text: str, largest: float = LARGEST_MAGNITUDE) -> list[float] | None:
@@ -68,8 +69,9 @@ def parse_numbers(text: str, largest: float = LARGEST_MAGNITUDE) -> list[float] 
     parts = text.split()
     if not all(map(NUMBER.fullmatch, parts)):
         return None
-    values = [float(part) for part in parts]
-    return values if all(abs(value) <= largest for value in values) else None
+    values = list(map(float, parts))
+    small = not values or (max(values) <= largest and min(values) >= -largest)
+    return values if small else None
 
 
 class XmlFile:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -154,6 +155,10 @@ def finite_number(value: Any, name: str, element: str) -> float:
     return float(array)
 
 
+def _is_finite_float(value: Any) -> bool:
+    return type(value) is float and math.isfinite(value)
+
+
 def finite_numbers(
     values: Any, count: int, name: str, remedy: str, element: str | None = None
 ) -> tuple[float, ...]:
@@ -164,6 +169,9 @@ def finite_numbers(
     InputError
         About ``element``, by default ``name``, with that ``remedy``, if they are anything else.
     """
+    plain_list = type(values) in (tuple, list) and len(values) == count
+    if plain_list and all(map(_is_finite_float, values)):
+        return tuple(values)
     array = finite_array(values, (count,))
     if array is None:
         raise InputError(

@@ -100,6 +100,14 @@ public:
         return weakest();
     }
 
+    // Factorises the rows that were written, and solves for the shortest x (nv,) with G x = g.
+    void factor_written(double threshold) { factor_columns(threshold); }
+    void shortest(const double* g, double* x) const {
+        projection_->normal(g, x);
+        projection_->unwhiten(x);
+    }
+    const std::vector<int>& support(int row) const { return pattern_.supports[row]; }
+
     int columns() const { return nv_; }
     int rows() const { return rows_; }
     const Projection& projection() const { return *projection_; }

@@ -222,6 +222,65 @@ struct PySystem {
         return owned_array(std::move(G), {n, rows, static_cast<std::size_t>(width)});
     }
 
+    // g (rows,) and G (rows, width), as of jacobians(), at one configuration q (nq,).
+    nb::tuple rows_at(double t, const Array& q) {
+        const auto rows = static_cast<std::size_t>(system->rows());
+        const std::size_t width = system->nv + (system->driven() ? 1 : 0);
+        std::vector<double> G(rows * width), g(rows);
+        system->closures_at(t, vector_of(q, system->nq, "q"), g.data(), G.data(),
+                            static_cast<int>(width));
+        return nb::make_tuple(owned_array(std::move(g)), owned_array(std::move(G), {rows, width}));
+    }
+
+    // Newton's iteration from q (nq,) onto the first rows of the system, as many as `algebra` has,
+    // without motions of drives: newton() of dynamics/constraints/newton.py, not monotone.  Errors
+    // are over row_unit (rows,), steps the shortest ones in units (nv,); pivots below `cut` of the
+    // longest row are zero.  The last configuration, and the largest error there.
+    nb::tuple close(Algebra& algebra, const Array& row_unit, const Array& units, const Array& q,
+                    int evaluations, double tolerance, double rounding, double cut) {
+        const int rows = algebra.rows(), nv = system->nv, nq = system->nq;
+        if (system->driven() || rows > system->rows() || algebra.columns() != nv)
+            throw nb::value_error("the rows are not those of the algebra");
+        const double* const over = vector_of(row_unit, rows, "row_unit");
+        const double* const unit = vector_of(units, nv, "units");
+        const double* const start = vector_of(q, nq, "q");
+        std::vector<double> at(nq + nv, 0.0), delta(2 * nv, 0.0), g(system->rows());
+        std::vector<double> G(static_cast<std::size_t>(system->rows()) * nv);
+        std::copy_n(start, nq, at.begin());
+        double error = std::numeric_limits<double>::infinity();
+        for (int k = 1; k <= evaluations; ++k) {
+            system->closures_at(0.0, at.data(), g.data(), G.data(), nv);
+            double size = 0.0, longest = 0.0;
+            for (int row = 0; row < rows; ++row) {
+                g[row] /= over[row];
+                size = std::isnan(g[row]) ? g[row] : std::max(size, std::abs(g[row]));
+                if (std::isnan(size)) break;
+            }
+            const bool stuck = 0.5 * error < size && size <= rounding;
+            error = size;
+            if (stuck || !(size > tolerance) || k == evaluations) break;
+            for (int row = 0; row < rows; ++row) {
+                double* const out = algebra.row(row);
+                double squares = 0.0;
+                for (const int j : algebra.support(row)) {
+                    out[j] = G[static_cast<std::size_t>(row) * nv + j] * (unit[j] / over[row]);
+                    squares += out[j] * out[j];
+                }
+                longest = std::max(longest, squares);
+            }
+            try {
+                algebra.factor_written(cut * std::sqrt(longest));
+            } catch (const EvaluationError&) {
+                break;
+            }
+            algebra.shortest(g.data(), delta.data());
+            for (int j = 0; j < nv; ++j) delta[j] *= -unit[j];
+            system->retract(at.data(), delta.data(), at.data());
+        }
+        at.resize(nq);
+        return nb::make_tuple(owned_array(std::move(at)), error);
+    }
+
     // Forces (n, drives) of the drives, NaN where rows depend on each other.
     nb::object drive_forces(const Array& t, const Array& states) {
         const std::size_t n = count_of(t, states, state_size()), nx = state_size();
@@ -364,6 +423,10 @@ void bind_system(nb::module_& m) {
              })
         .def("closure_errors", &PySystem::closure_errors)
         .def("jacobians", &PySystem::jacobians)
+        .def("rows_at", &PySystem::rows_at)
+        .def("close", &PySystem::close, nb::arg("algebra"), nb::arg("row_unit"), nb::arg("units"),
+             nb::arg("q"), nb::arg("evaluations"), nb::arg("tolerance"), nb::arg("rounding"),
+             nb::arg("cut"))
         .def("drive_forces", &PySystem::drive_forces)
         .def("reactions", &PySystem::reactions, nb::arg("all"), nb::arg("scale"), nb::arg("t"),
              nb::arg("states"))

@@ -10,6 +10,7 @@ import pinocchio as pin
 from srm_mbs._kernel import core
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.row_algebra import CompiledAlgebra, RowAlgebra
 from srm_mbs.dynamics.constraints.rows import COINCIDENT, LoopKinematics
 
 _NO_NUMBERS = np.zeros(0)
@@ -88,9 +89,6 @@ class ClosureRows:
         }
         data = core.SystemData(**fields, **closure_structs(LoopKinematics.constants(rows)))
         self._kernel = core.System(model, data, None)
-        self._time = np.zeros(1)
-        self._state = np.zeros((1, model.nq + nv))
-        self._q = self._state[:, : model.nq]
 
     def evaluate(self, q: FloatArray) -> None:
         """Evaluate g and G at the configuration q (nq,).
@@ -101,13 +99,45 @@ class ClosureRows:
             If the points of a ``distance`` coincide.
         """
         if self._kernel is not None:
-            self._q[0] = q
             try:
-                self.g = self._kernel.closure_errors(self._time, self._state)[0][0]
-                self.G = self._kernel.jacobians(self._time, q)[0]
+                self.g, self.G = self._kernel.rows_at(0.0, np.ascontiguousarray(q))
             except ArithmeticError:
                 pass  # the reference raises the error that says why
             else:
                 return
         self._rows.evaluate(self._model, self._data, q)
         self.g, self.G = self._rows.g.copy(), self._rows.G.copy()
+
+    def close(
+        self,
+        algebra: RowAlgebra | CompiledAlgebra,
+        row_unit: FloatArray,
+        units: FloatArray,
+        q: FloatArray,
+        evaluations: int,
+        **ends: float,
+    ) -> tuple[FloatArray, float] | None:
+        """Newton's iteration from q (nq,) onto the first rows, as many as ``algebra`` has, in one
+        call of the kernel; None without it, and where the rows cannot be evaluated.
+
+        Parameters
+        ----------
+        row_unit : (rows,), units : (nv,)
+            Errors over their units; steps are the shortest in those of the coordinates.
+        evaluations, ends
+            As for :func:`~srm_mbs.dynamics.constraints.newton.newton`, not monotone:
+            ``tolerance``, ``rounding``; ``cut``, pivots over the longest row that are zero.
+
+        Returns
+        -------
+        tuple
+            The last configuration, and the largest error there, over its unit.
+        """
+        if self._kernel is None or not isinstance(algebra, CompiledAlgebra):
+            return None
+        try:
+            return self._kernel.close(  # type: ignore[no-any-return]
+                algebra.compiled, row_unit, units, np.ascontiguousarray(q), evaluations, **ends
+            )
+        except ArithmeticError:
+            return None

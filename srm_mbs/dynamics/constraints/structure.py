@@ -150,6 +150,18 @@ class ManifoldSampler:
         largest error left, in row units."""
         if not self.closed:
             return q, 0.0
+        found = self._rows.close(
+            self._in_units,
+            self.row_unit,
+            self.units.coordinate,
+            q,
+            iterations + 1,
+            tolerance=CLOSURE_ROUNDING,
+            rounding=STUCK,
+            cut=CLOSING_RANK,
+        )
+        if found is not None:
+            return found
         against, own = -self.units.coordinate, slice(self.closed)
 
         def linearise(q: FloatArray) -> tuple[float, Callable[[], FloatArray | None]]:

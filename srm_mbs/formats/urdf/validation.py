@@ -21,7 +21,7 @@ from srm_mbs.errors import SrmWarning
 from srm_mbs.formats.graph.joint_graph import ROOT_JOINT, inertia_at, inertia_tensor
 from srm_mbs.formats.urdf.graph import Graph, origin_placement
 from srm_mbs.formats.urdf.joint_types import EXTENDED_TYPES
-from srm_mbs.formats.xml import NAMESPACED, XmlFile, local_name, words
+from srm_mbs.formats.xml import NAMESPACED, XmlFile, local_name, parse_numbers, words
 from srm_mbs.model.anchors import WORLD
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
@@ -89,7 +89,9 @@ class ElementChecker(XmlFile):
             raise self.fault(where, f"<{tag}> has no {key!r}", f'Give {key}="..."')
         # Limits do not act, and exporters write the largest double there.
         largest = sys.float_info.max if tag == "limit" else LARGEST_MAGNITUDE
-        values: list[float] = self.numbers(text, count, where, f"<{tag} {key}>", largest).tolist()
+        values = parse_numbers(text, largest)
+        if values is None or len(values) != count:
+            values = self.numbers(text, count, where, f"<{tag} {key}>", largest).tolist()
         node.set(key, " ".join(map(repr, values)))
         return values
 

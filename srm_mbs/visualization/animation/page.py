@@ -58,6 +58,8 @@ NAMED_LOOPS, NAMED_PASSAGES = 12, 100
 CRANK_STEPS = 360
 """Steps of the arrow keys in a motion back and forth of a crank; of a turn they are degrees."""
 DRIFT, ENERGY = "drift |g|", "energy change"
+BETWEEN_STEPS = f"{DRIFT} between steps"
+"""Drift of the dense output, which the page shows: at steps it is smaller."""
 FLOAT32_ARRAY = 0x17
 """Type of an array of single precision in the MessagePack of msgpack-lite, with which meshcat
 reads."""
@@ -174,7 +176,7 @@ def values_over_time(solution: SimulationResult, times: FloatArray) -> dict[str,
 
     with np.errstate(over="ignore", invalid="ignore"):
         if unit:
-            add(DRIFT, unit, run.drift[:, 0])
+            add(BETWEEN_STEPS, unit, run.drift[:, 0])
         add(ENERGY, "J", run.energy - solution.at(times[:1]).energy)
         if unit and solution.steps.count:
             add("sigma", "", sigma_at(solution, times))

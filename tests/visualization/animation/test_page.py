@@ -85,7 +85,7 @@ def test_the_panel_shows_time_drift_energy_and_sigma_of_the_run_at_that_time(
     there = slider_crank.at([0.0, t])
     found = panel(page, t)
     assert found["t"] == (pytest.approx(t, abs=5.1e-4), "s")
-    assert found["drift |g|"] == (pytest.approx(there.drift[1, 0], rel=6e-3), "m")
+    assert found["drift |g| between steps"] == (pytest.approx(there.drift[1, 0], rel=6e-3), "m")
     change = there.energy[1] - there.energy[0]
     assert found["energy change"] == (pytest.approx(change, rel=6e-3), "J")
     # Evaluated there; in the panel it is recorded at the stages.
@@ -680,7 +680,10 @@ def test_closures_are_drawn_while_they_are_there_and_not_before_or_after(
         end = srm.Anchor("rod", xyz=(2.0, 0.0, 0.0))
         assert np.abs(rope - place(let_go_and_tied, 1.2, end)).max() < 1e-6
         rows = {name: value for name, value, _ in page.evaluate(READ, 0.7)}
-        assert (rows["drift |g|"], rows["sigma"]) == ("0", "\u2013")  # there are no closures
+        assert (rows["drift |g| between steps"], rows["sigma"]) == (
+            "0",
+            "\u2013",
+        )  # there are no closures
         page.evaluate("seek(1.45)")
         page.evaluate("animator.play()")
         page.wait_for_function("animator.time < 0.4")  # over again

@@ -1,0 +1,83 @@
+"""Values that look like those of other units: what is noted and warned of when a file is loaded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import pinocchio as pin
+
+from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.scaling import is_angle, scene_diagonal
+
+LARGEST_START = 4.0 * math.pi
+"""Angle (rad) of a start above which it may be in degrees."""
+LARGEST_GYRATION = 10.0
+"""Radius of gyration of a body, over the size of the mechanism, above which a unit is doubtful."""
+SMALLEST_GYRATION = 1e-3
+"""The same over the size of the body, below which it is; point masses have none."""
+
+
+def doubtful_angles(mechanism: Mechanism, element: str, values: Mapping[str, Any]) -> Iterator[str]:
+    """Sentences about angles among ``values`` of ``element``, joint -> position, that may be in
+    degrees."""
+    for name, value in values.items():
+        single = isinstance(value, int | float) and abs(value) > LARGEST_START
+        if single and name in mechanism.joint_names and is_angle(mechanism.model, name):
+            yield (
+                f"{element}: the angle {value:g} of the joint {name!r} is more than two turns: "
+                f"angles are in rad, and {value:g} degrees are {math.radians(value):.6g} rad"
+            )
+
+
+def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:
+    """Sentences about bodies whose mass and moments of inertia do not fit to each other, or to the
+    size of the body or of the mechanism at q0.
+
+    The size of a body is the largest distance of its joints, anchors and centre of mass from the
+    origin of the joint that moves it.
+    """
+    model = mechanism.model
+    scene = scene_diagonal(mechanism, mechanism.q0)
+    sizes = [0.0] * model.njoints
+    ends = [
+        (model.parents[joint], model.jointPlacements[joint]) for joint in range(1, model.njoints)
+    ]
+    ends += [anchor.resolve(model) for loop in mechanism.loops for anchor in loop.anchors]
+    for joint, place in ends:
+        sizes[joint] = max(sizes[joint], math.hypot(*place.translation.tolist()))
+    for joint in range(1, model.njoints):
+        body = model.inertias[joint]
+        half_trace = 0.5 * max(sum(body.inertia.diagonal().tolist()), 0.0)
+        if body.mass == 0.0:
+            if half_trace > 0.0:
+                yield (
+                    f"{_body(model, joint)} has moments of inertia, {half_trace:.3g} kg m^2, and "
+                    "no mass: give its links a mass"
+                )
+            continue
+        # The largest principal moment of a real body is a third to a half of the trace.
+        gyration = math.sqrt(half_trace / body.mass)
+        size = max(sizes[joint], math.hypot(*body.lever.tolist()))
+        if gyration > LARGEST_GYRATION * scene > 0.0:
+            yield (
+                f"{_body(model, joint)} has a radius of gyration of {gyration:.3g} m in a "
+                f"mechanism of {scene:.3g} m: moments of inertia are in kg m^2 "
+                "(1 kg mm^2 is 1e-6 kg m^2), and lengths in m"
+            )
+        elif 0.0 < gyration < SMALLEST_GYRATION * size:
+            yield (
+                f"{_body(model, joint)} has a radius of gyration of {gyration:.3g} m and a size of "
+                f"{size:.3g} m: lengths are in m (1 mm is 0.001 m), and moments of inertia in "
+                "kg m^2"
+            )
+
+
+def _body(model: pin.Model, joint: int) -> str:
+    links = (
+        frame.name
+        for frame in model.frames
+        if frame.type == pin.FrameType.BODY and frame.parentJoint == joint
+    )
+    return f"the body of the joint {model.names[joint]!r} ({', '.join(map(repr, links))})"

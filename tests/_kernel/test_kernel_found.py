@@ -80,7 +80,12 @@ class Machine:
         return subprocess.run(
             [sys.executable, *map(str, arguments)],
             cwd=folder,
-            env=environment | {"PYTHONPATH": str(self.site), "PYTHONDONTWRITEBYTECODE": "1"},
+            env=environment
+            | {
+                "PYTHONPATH": str(self.site),
+                "PYTHONDONTWRITEBYTECODE": "1",
+                "SRM_MBS_CACHE": str(self.neutral.with_name("cache")),
+            },
             capture_output=True,
             text=True,
             check=False,

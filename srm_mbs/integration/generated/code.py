@@ -84,8 +84,8 @@ class Library(NamedTuple):
     compiled: Compiled
 
 
-_GENERATOR = ("structure", "expressions", "terms", "algebra")
-"""Modules that determine the source of a structure."""
+_NO_GENERATOR = ("code", "code_cache", "policy")
+"""Modules of this package on which the source of a structure does not depend."""
 _libraries: OrderedDict[Structure, Library] = OrderedDict()
 _lock = Lock()
 _arrivals = 0
@@ -220,9 +220,9 @@ def identity_of(structure: Structure) -> str:
 def _generator() -> str:
     """The digest of the modules that write a source."""
     digest = hashlib.sha256()
-    for name in _GENERATOR:
-        text = pkgutil.get_data(__package__, f"{name}.py")
-        digest.update(text or b"")
+    for module in pkgutil.iter_modules([os.path.dirname(__file__)]):
+        if module.name not in _NO_GENERATOR:
+            digest.update(pkgutil.get_data(__package__, f"{module.name}.py") or b"")
     return digest.hexdigest()
 
 

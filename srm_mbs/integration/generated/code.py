@@ -87,6 +87,8 @@ class Library(NamedTuple):
 _NO_GENERATOR = ("code", "code_cache", "policy")
 """Modules of this package on which the source of a structure does not depend."""
 _libraries: OrderedDict[Structure, Library] = OrderedDict()
+_refused: dict[Structure, str] = {}
+"""Why no code can be generated for a structure: finding out may take a second."""
 _lock = Lock()
 _arrivals = 0
 
@@ -200,14 +202,18 @@ def source_of_structure(structure: Structure) -> Source:
     InputError
         If it cannot be generated.
     """
+    known = _refused.get(structure)
+    if known is not None:
+        raise _not_generated(known)
     try:
         source = source_of(structure)
+        if source.operations > MOST_OPERATIONS:
+            raise UnsupportedElementError(
+                f"it would have {source.operations} statements, more than {MOST_OPERATIONS}"
+            )
     except UnsupportedElementError as error:
+        _refused[structure] = str(error)
         raise _not_generated(str(error)) from error
-    if source.operations > MOST_OPERATIONS:
-        raise _not_generated(
-            f"it would have {source.operations} statements, more than {MOST_OPERATIONS}"
-        )
     return source
 
 

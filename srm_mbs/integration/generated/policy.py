@@ -100,8 +100,6 @@ class _Job(NamedTuple):
 
 
 _accounts: dict[tuple[int, ...], _Account] = {}
-_refused: set[Structure] = set()
-"""Structures whose code cannot be generated."""
 _lock = Lock()
 """Held by the thread that changes the job; others do not wait for it."""
 _job: _Job | None = None
@@ -253,16 +251,10 @@ def _begin(mechanism: Mechanism, use: _Use) -> None:
     account = use.account
     try:
         structure, parameters = structure_of_mechanism(mechanism)
-        if structure in _refused:
-            use.settled = True
-        if use.settled or cached_library(structure, parameters) is not None:
+        if cached_library(structure, parameters) is not None:  # of another process
             account.used = 0.0
             return
-        try:
-            source = source_of_structure(structure)
-        except InputError:
-            _refused.add(structure)
-            raise
+        source = source_of_structure(structure)
     except InputError as error:
         account.used = 0.0
         _settle(mechanism, use, error)

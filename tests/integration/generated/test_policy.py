@@ -43,8 +43,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("SRM_MBS_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(code, "_libraries", type(code._libraries)())
     monkeypatch.setattr(code, "_arrivals", 0)
+    monkeypatch.setattr(code, "_refused", {})
     for name, value in {
-        **{"_accounts": {}, "_refused": set(), "_job": None, "_failed": False},
+        **{"_accounts": {}, "_job": None, "_failed": False},
         **{"START_SECONDS": 0.002, "STATEMENT_SECONDS": 0.0, "PAIR_SECONDS": 0.0},
     }.items():
         monkeypatch.setattr(policy, name, value)
@@ -267,6 +268,21 @@ def test_segments_of_a_run_keep_its_backend_while_code_arrives() -> None:
     assert len(solution.segments) > 3
     assert {part.settings.backend for part in solution.segments} == {"kernel"}
     assert finished(mechanism, 3.0, events=crossing).settings.backend == "generated"
+
+
+def test_a_run_with_code_stays_with_its_backend_where_it_switches_the_mechanism() -> None:
+    mechanism = srm.load("four_bar")
+    free = mechanism.without_loop(mechanism.loops[0].name)
+    release = srm.Event(
+        lambda t, q, v: t - 0.5, terminal=False, action=lambda t, q, v: srm.Switch(free, q, v)
+    )
+    assert finished(mechanism, 1.0, events=release).settings.backend == "kernel"
+    srm.compile(mechanism)
+    assert srm.backend(free) == "kernel"
+    solution = finished(mechanism, 1.0, events=release)
+    assert [part.settings.backend for part in solution.segments] == ["generated"] * 2
+    again = finished(mechanism, 1.0, events=release, backend="generated")
+    assert np.array_equal(again.q, solution.q)
 
 
 def test_steps_of_a_run_with_output_times_are_made_again_by_its_backend() -> None:

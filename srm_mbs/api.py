@@ -398,7 +398,9 @@ def simulate(
         ``"python"``, the readable reference; ``"kernel"``, the compiled kernel, which is many times
         faster and has the split PSRM with automatic placement or none; ``"generated"``, the kernel
         with code that is generated and compiled for this mechanism (:func:`srm_mbs.compile`);
-        ``"auto"``, the kernel wherever it can be used (:func:`srm_mbs.backend`).
+        ``"auto"``, the kernel wherever it can be used (:func:`srm_mbs.backend`), with generated
+        code if the mechanism has it when the run begins.  Mechanisms that are used much get it
+        (docs/kernel.md).  With ``settings.backend`` of its solution a run is repeated bit by bit.
     raise_on_failure
         Raise :class:`SimulationError` instead of returning a partial solution.
     singular_tolerance
@@ -564,7 +566,10 @@ def load_solution(
 
 
 def compile(mechanism: Mechanism) -> CompiledMechanism:
-    """Generate the code of a mechanism's terms and compile it, for ``backend="generated"``.
+    """Generate the code of a mechanism's terms and compile it, for all runs to come.
+
+    Runs with ``backend="auto"`` do so by themselves once the mechanism has used as much CPU time as
+    compilation takes.
 
     The code computes what an evaluation of this mechanism needs: constants, zeros and units are
     gone.  It stays in a folder of the user's cache, and mechanisms of the same structure share it,

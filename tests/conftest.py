@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import tempfile
@@ -20,10 +21,14 @@ DATA = Path(__file__).parent / "data"
 # Tests leave the user's compiled code alone; all processes of a session share theirs.
 _CACHE = tempfile.TemporaryDirectory(prefix="srm-mbs-tests-")
 os.environ.setdefault("SRM_MBS_CACHE", _CACHE.name)
+atexit.register(_CACHE.cleanup)
 
-# Without a kernel the tests ask for the Python reference, which runs would warn of.
+# What "auto" takes depends on what was compiled before: tests run on the kernel, unless they or the
+# environment ask for another backend.  Without a kernel they ask for the Python reference, which
+# runs would warn of.
 if srm.backend() == "python":
     os.environ["SRM_MBS_BACKEND"] = "python"
+os.environ.setdefault("SRM_MBS_BACKEND", "kernel")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

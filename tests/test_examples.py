@@ -18,6 +18,7 @@ from tools.pages import DOCS, PRINTS
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 TUTORIALS = sorted(tutorials.PICTURES)
+NAMES = ("SRM_MBS_BACKEND", "SRM_MBS_CACHE")
 Ran = Callable[[str], tuple[str, Path]]
 
 
@@ -29,7 +30,7 @@ def run(path: Path, folder: Path) -> str:
         text=True,
         check=False,
         env={"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1", "MPLBACKEND": "agg"}
-        | {name: os.environ[name] for name in ("SRM_MBS_BACKEND",) if name in os.environ},
+        | {name: os.environ[name] for name in NAMES if name in os.environ},
     )
     assert done.returncode == 0, done.stderr
     return done.stdout

@@ -209,5 +209,7 @@ def measure_problem(
                     extra = max(0.0, seconds - measurement.cpu["median"])
         if peer.name == OURS:  # the peers get what was read; we read it
             build += load
-        results.preparations.append(Preparation(problem.name, peer.name, build, extra))
+        results.preparations.append(
+            Preparation(problem.name, peer.name, build, extra, peer.compiler_time)
+        )
         save()

@@ -18,7 +18,7 @@ from benchmarks.work_precision.counting import LEVELS
 from benchmarks.work_precision.records import FLOOR, OURS, TAYLOR, Results
 from benchmarks.work_precision.tables import (
     DEFAULT_VARIANTS,
-    GENERATED_VARIANTS,
+    KERNEL_VARIANTS,
     Best,
     best,
     markdown,
@@ -52,8 +52,8 @@ def _measured(results: Results, problems: Sequence[str]) -> list[str]:
 
 
 def table(results: Results, problems: Sequence[str] | None = None) -> str:
-    """Our default and generated code, the best simulator and equations written by hand at every
-    level, in CPU ms; what heyoka's first run took longer than the others, for its compilation.
+    """Our default, with generated code and without it, the best simulator and equations written by
+    hand at every level, in CPU ms; what compilation took, of heyoka its first run more than others.
 
     Parameters
     ----------
@@ -64,24 +64,20 @@ def table(results: Results, problems: Sequence[str] | None = None) -> str:
     for problem in problems or list(results.problems):
         facts = results.problems[problem]
         ours = [best(results, problem, [OURS], level, DEFAULT_VARIANTS) for level in LEVELS]
-        generated = [best(results, problem, [OURS], level, GENERATED_VARIANTS) for level in LEVELS]
+        kernel = [best(results, problem, [OURS], level, KERNEL_VARIANTS) for level in LEVELS]
         peers = [best(results, problem, simulators(results), level) for level in LEVELS]
         floor = [best(results, problem, [FLOOR], level) for level in LEVELS]
         taylor = [best(results, problem, [TAYLOR], level) for level in LEVELS]
-        compilation = next(
-            (
-                row.first_call
-                for row in results.preparations
-                if (row.problem, row.peer) == (problem, TAYLOR)
-            ),
-            None,
-        )
+        own = [row for row in results.preparations if row.problem == problem]
+        compiler = next((row.compiler for row in own if row.peer == OURS), None)
+        compilation = next((row.first_call for row in own if row.peer == TAYLOR), None)
         names = dict.fromkeys(results.peers[entry.peer] for entry in peers if entry)
         rows.append(
             (
                 facts["title"],
                 _triple(ours),
-                _triple(generated) if any(generated) else "",
+                f"{compiler:.2g}" if compiler else "",
+                _triple(kernel) if any(kernel) else "",
                 _triple(peers),
                 "; ".join(names) or "none",
                 " / ".join(_ratio(peer, own) for peer, own in zip(peers, ours)),
@@ -94,7 +90,8 @@ def table(results: Results, problems: Sequence[str] | None = None) -> str:
     header = (
         f"CPU ms at error {levels}",
         "srm_mbs",
-        "srm_mbs, generated code",
+        "its code compiles, s",
+        "srm_mbs, kernel without code",
         "best other simulator",
         "which",
         "ratio",

@@ -46,12 +46,14 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Preparation:
-    """Seconds to build a peer's model, and what its first call took more than the later ones."""
+    """Seconds to build a peer's model, what its first call took more than the later ones, and what
+    a C compiler took; None without one."""
 
     problem: str
     peer: str
     build: float
     first_call: float | None
+    compiler: float | None = None
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Cost per evaluation and per step against size, beside ``pin.constraintDynamics``.
 
-N-four-bars for loops, open chains for coordinates.  ``run``: whole runs with the default backend,
-over their evaluations or steps.  Where the time goes:
+N-four-bars for loops, open chains for coordinates.  ``run``: whole runs of the kernel, without
+generated code, over their evaluations or steps.  Where the time goes:
 
 * Pinocchio: in the kernel the pass over the tree in a loop of its own; in the Python backend its
   calls (0.25 us of each is the call itself);
@@ -143,7 +143,7 @@ def _inside(mechanism: srm.Mechanism, t_end: float, repeats: int) -> tuple[float
         for _ in range(3 * repeats):
             spent = 0.0
             start = time.process_time()
-            srm.simulate(mechanism, t_end, rtol=RTOL)
+            srm.simulate(mechanism, t_end, rtol=RTOL, backend="kernel")
             found.append((time.process_time() - start, spent))
     cost, inside = min(found)
     return 1e6 * cost, 1e6 * inside
@@ -166,20 +166,21 @@ def _ours(
     mechanism: srm.Mechanism, repeats: int, whole_python: bool = True
 ) -> dict[str, float | None]:
     """The columns of ours; without ``whole_python`` those of Python runs are None."""
-    probe = srm.simulate(mechanism, 0.5, rtol=RTOL)
+    by = "python" if srm.backend() == "python" else "kernel"
+    probe = srm.simulate(mechanism, 0.5, rtol=RTOL, backend=by)
     t_end = 0.5 * STEPS / max(probe.stats.steps, 1)
     found = parts(mechanism, repeats)
     pinocchio, lapack_part, evaluation = (
         found[key] for key in ("pinocchio", "lapack", "evaluation")
     )
-    cost, evaluations, steps = _run_cost(mechanism, "auto", t_end, repeats)
+    cost, evaluations, steps = _run_cost(mechanism, by, t_end, repeats)
     auto = cost / evaluations
     row: dict[str, float | None] = {
         "run, per evaluation (us)": auto,
         "run, per step (us)": cost / steps,
     }
     python: float | None = None
-    if srm.backend() != "kernel":
+    if by == "python":
         python = auto
     else:
         whole, inside = _inside(mechanism, t_end, repeats)
@@ -247,7 +248,7 @@ def measure_scaling(
             say(f"scaling: N = {n} left out: the analysis at load would take too long")
             break
         whole = n <= LOOPS_OF_ALL
-        if not whole and srm.backend() != "kernel":
+        if not whole and srm.backend() == "python":
             say(f"scaling: N = {n} left out: the Python backend would take too much memory")
             break
         load = timing.once(lambda problem=problem: problem.mechanism.structure)[0]

@@ -16,8 +16,8 @@ DEFAULT_VARIANTS = ("dop853, auto", "auto, auto")
 """What somebody gets who sets nothing but the tolerance: the first, or the second where the problem
 is stiff."""
 
-GENERATED_VARIANTS = ("dop853, generated", "auto, generated")
-"""The same with code that is compiled for the mechanism."""
+KERNEL_VARIANTS = ("dop853, kernel", "auto, kernel")
+"""The same without code that is compiled for the mechanism, where the defaults have it."""
 
 
 @dataclass(frozen=True)
@@ -233,13 +233,14 @@ def text(results: Results) -> str:
         levels = " / ".join(f"{level:.0e}" for level in LEVELS)
         parts += [f"## Everyone: CPU ms at error {levels}\n", _everyone(results), ""]
         parts += ["## Problems and their references\n", _problems(results), ""]
-        parts += ["## Build and first call, not in the times above (ms)\n"]
+        parts += ["## Build, C compiler and first call, not in the times above (ms)\n"]
         rows = (
             (row.problem, results.peers[row.peer], milliseconds(row.build),
-             milliseconds(row.first_call))
+             milliseconds(row.compiler), milliseconds(row.first_call))
             for row in results.preparations
         )  # fmt: skip
-        parts += [markdown(("problem", "peer", "build", "first call, extra"), rows), ""]
+        header = ("problem", "peer", "build", "C compiler", "first call, extra")
+        parts += [markdown(header, rows), ""]
     if results.reliability:
         parts += ["## Reliability, settings that nobody tuned\n", _reliability(results), ""]
     if results.unneeded:

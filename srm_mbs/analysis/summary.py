@@ -17,7 +17,7 @@ from srm_mbs.dynamics.constraints.rows import closure_errors
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import angle_coordinates, is_angle, row_angles, scene_diagonal
 from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
-from srm_mbs.integration.kernel.backend import backend
+from srm_mbs.integration.kernel.backend import backend, code_status
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.coordinates import position_of
@@ -114,6 +114,7 @@ def mechanism_rows(mechanism: Mechanism) -> list[tuple[str, str]]:
     if mechanism.drives:
         freedom += f", {found.degrees_of_freedom} without the drives"
     idle = [f"{', '.join(motion.joints)} ({motion.directions})" for motion in found.idle]
+    code = code_status(mechanism)
     mass = sum(body.mass for body in mechanism.model.inertias.tolist()[1:])
     return [
         ("mechanism", mechanism.name),
@@ -129,7 +130,8 @@ def mechanism_rows(mechanism: Mechanism) -> list[tuple[str, str]]:
         ("redundant rows, left to pivoting", f"{structure.pivoted_redundancy}"),
         ("joints that cannot move", ", ".join(found.unreachable_joints) or "none"),
         ("joints that move no loop", "; ".join(idle) or "none"),
-        ("runs on", BACKENDS[backend()]),
+        ("runs on", BACKENDS[backend(mechanism)]),
+        *([] if code is None else [("generated code", code)]),
     ]
 
 

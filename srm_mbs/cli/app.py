@@ -408,8 +408,9 @@ def compile_model(
 ) -> None:
     """Compile code for one mechanism.
 
-    Runs with --backend generated use it.  It needs a C compiler (cc, or the environment variable
-    CC).  The code stays in the cache of the user: srm-mbs cache shows where.
+    Runs of this mechanism, and of others of its topology, use it from then on.  It needs a C
+    compiler: cc, that of the environment variable CC, or the Python package ziglang.  The code
+    stays in the cache of the user: srm-mbs cache shows where.
     """
     from srm_mbs.integration.generated.code import generated_source
 

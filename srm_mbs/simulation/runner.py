@@ -47,9 +47,9 @@ from srm_mbs.integration.critical_passages import CriticalPassages, examined_pas
 from srm_mbs.integration.dense_output import DenseOutput, StepData
 from srm_mbs.integration.driver import RunRecord, RunStatus, StepSink
 from srm_mbs.integration.events import EventWatch, StateFunction, prepare_events
-from srm_mbs.integration.generated.code import code_of_run
+from srm_mbs.integration.generated.policy import Meter, code_of_run
 from srm_mbs.integration.kernel import driver as kernel_driver
-from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend
+from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend, code_is_compiled
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
 from srm_mbs.integration.kernel.marshalling import state_from
@@ -156,6 +156,8 @@ class Problem:
         Whether that segment was stiff at its end.
     code
         The generated code that computes the terms; None without it.
+    meter
+        Counts the time of a run for which code may be compiled; None for others.
     """
 
     mechanism: Mechanism
@@ -174,6 +176,7 @@ class Problem:
     last_step: float = 0.0
     stiff: bool = False
     code: Any = None
+    meter: Meter | None = None
 
 
 def run_segment(
@@ -463,6 +466,8 @@ def assemble_problem(
     )
     problem = Problem(mechanism, options, system, norm, state, intervals, by, held, watch, passages)
     problem.code = code
+    if by == "kernel" and options.backend == "auto" and code_is_compiled():
+        problem.meter = Meter(mechanism)
     problem.kernel_system, problem.last_step = kernel_system, last_step
     problem.stiff = before is not None and bool(before.steps.stiff[-1:].any())
     # Sweeps say at the end what they met in their steps.
@@ -609,6 +614,7 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
             passing=handler,
             passages=problem.passages,
             sink=problem.stream,
+            meter=problem.meter,
         )
     handler.done()
     return record, (record,)
@@ -794,7 +800,7 @@ class FinishedRun:
             if isinstance(kept, StreamedOutput):
                 self.steps, self.output = None, kept
                 if not self._controlled:
-                    repeated = self._options._replace(t_eval=None)
+                    repeated = self._options._replace(t_eval=None, backend=self._backend)
                     self.again = partial(run_segment, self._mechanism, repeated, result_type)
             else:
                 self.steps = kept

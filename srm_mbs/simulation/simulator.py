@@ -23,8 +23,8 @@ from srm_mbs.errors import (
     safe_repr,
 )
 from srm_mbs.integration.breakpoints import smooth_intervals
-from srm_mbs.integration.generated.code import code_of_run
-from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend
+from srm_mbs.integration.generated.policy import charge, code_of_run
+from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend, code_is_compiled
 from srm_mbs.integration.messages import FailureCause
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -53,6 +53,8 @@ WATCHED_FORCES = 8
 """Numbers of steps whose forces are examined where they may be unstable."""
 MANY_STEPS = 100
 """Inner steps of one step, from which they are."""
+CHARGED = 0.05
+"""Time (s) within steps after which it is counted for the policy of generated code."""
 BREAKPOINT_ROUNDING = 1e-14
 """Distance of a breakpoint from the end of a step that is rounding, over the time."""
 
@@ -104,6 +106,8 @@ class Simulator:
         self._norm = error_norm(mechanism, options)
         by = chosen_backend(backend, options.method, options.placement, options.singular_times)
         self._backend, _ = code_of_run(by, backend, mechanism)
+        metered = self._backend == "kernel" and backend == "auto" and code_is_compiled()
+        self._charge_every = CHARGED if metered else math.inf
         self._no_force = np.zeros(mechanism.model.nv)
         self._make()
         self.reset()
@@ -119,6 +123,7 @@ class Simulator:
         self._nq = self._mechanism.model.nq
         self._smooth = not len(self._mechanism.breakpoints(-math.inf, math.inf))
         self._wall_time = 0.0
+        self._charge_at = self._charge_every
         self._forces: deque[FloatArray] = deque(maxlen=WATCHED_FORCES)
         self._last_dt = math.inf
         self._busy = False
@@ -214,6 +219,8 @@ class Simulator:
             raise _failed(self.t, cause) from error
         finally:
             self._wall_time += time.perf_counter() - started
+            if self._wall_time >= self._charge_at:
+                self._charge()
         state = run.state
         return state[: self._nq], state[self._nq :]
 
@@ -247,6 +254,11 @@ class Simulator:
         except EvaluationError as error:
             raise SimulationError(f"Stopped at t = {t:.6g} s: {error}.", None) from error
         self._pending_start = None
+
+    def _charge(self) -> None:
+        """Count the time of the last steps, for which code may be compiled for others."""
+        charge(self._mechanism, self._wall_time - self._charge_at + self._charge_every)
+        self._charge_at = self._wall_time + self._charge_every
 
     def _watch(self) -> HeldForceWatch:
         """The signs of an unstable controller in the forces of the last samples."""

@@ -18,6 +18,7 @@ import pytest
 import srm_mbs as srm
 import srm_mbs._kernel
 from benchmarks.work_precision import command
+from srm_mbs.integration.generated.code_cache import compiler
 
 ROOT = Path(__file__).parents[2]
 EXTENSION = getattr(srm_mbs._kernel.core, "__file__", None)
@@ -80,7 +81,12 @@ class Machine:
         return subprocess.run(
             [sys.executable, *map(str, arguments)],
             cwd=folder,
-            env=environment | {"PYTHONPATH": str(self.site), "PYTHONDONTWRITEBYTECODE": "1"},
+            env=environment
+            | {
+                "PYTHONPATH": str(self.site),
+                "PYTHONDONTWRITEBYTECODE": "1",
+                "SRM_MBS_CACHE": str(self.neutral.with_name("cache")),
+            },
             capture_output=True,
             text=True,
             check=False,
@@ -120,7 +126,12 @@ def test_the_benchmark_of_a_checkout_measures_the_kernel(machine: Machine) -> No
     run = machine.python(machine.checkout, machine.script, *BENCHMARK)
     assert run.returncode == 0, run.stderr
     results = json.loads((machine.checkout / "measured" / "results.json").read_text())
-    assert results["settings"]["backend"] == "kernel"
+    generated = compiler() is not None
+    assert results["settings"]["backend"] == ("generated" if generated else "kernel")
+    (preparation,) = results["preparations"]
+    assert (preparation["compiler"] is not None) == generated
+    variants = {row["variant"] for row in results["measurements"]}
+    assert ("dop853, kernel" in variants) == generated
     assert results["peers"] == {"ours": "srm_mbs"}
     elsewhere = machine.python(machine.neutral, machine.script, *BENCHMARK)
     assert elsewhere.returncode == 2

@@ -77,6 +77,8 @@ class Peer(ABC):
     title: str
     modules: tuple[str, ...] = ()
     implicit = False
+    compiler_time: float | None = None
+    """Seconds that a C compiler took, beside this process, to prepare the last problem."""
 
     def check(self, problem: Problem) -> None:
         """Raises NotApplicableError if the peer is not for problems of that kind."""

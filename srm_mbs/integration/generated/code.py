@@ -6,8 +6,12 @@ cache of the user, or newly compiled.
 
 from __future__ import annotations
 
+import hashlib
+import os
+import pkgutil
 from collections import OrderedDict, deque
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
@@ -16,8 +20,10 @@ from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
-from srm_mbs.errors import InputError, get_logger
+from srm_mbs.errors import InputError
 from srm_mbs.integration.generated.code_cache import (
+    PATIENCE,
+    Compilation,
     CompilationError,
     Compiled,
     compile_and_load,
@@ -30,8 +36,6 @@ from srm_mbs.integration.generated.structure import (
 )
 from srm_mbs.integration.generated.terms import Source, source_of
 from srm_mbs.model.mechanism import MechanismData, per_model
-
-log = get_logger(__name__)
 
 MOST_OPERATIONS = 40_000
 """Statements of generated code: compilation takes about 0.15 ms each, and more for each the more
@@ -65,23 +69,45 @@ class CompiledMechanism(NamedTuple):
         return f"CompiledMechanism({self.operations} operations, {made})"
 
 
-class _Library(NamedTuple):
-    """The code of a structure in this process."""
+class Library(NamedTuple):
+    """The code of a structure in this process.
 
-    source: Source
+    Attributes
+    ----------
+    terms
+        A ``GeneratedTerms``; others are made from it.
+    compiled
+        How it was found.
+    """
+
     terms: Any
-    """A ``GeneratedTerms``; others are made from it."""
     compiled: Compiled
 
 
-_libraries: OrderedDict[Structure, _Library] = OrderedDict()
+_NO_GENERATOR = ("code", "code_cache", "policy")
+"""Modules of this package on which the source of a structure does not depend."""
+_libraries: OrderedDict[Structure, Library] = OrderedDict()
+_refused: dict[Structure, str] = {}
+"""Why no code can be generated for a structure: finding out may take a second."""
 _lock = Lock()
+_arrivals = 0
+
+
+def arrivals() -> int:
+    """How often code arrived in this process."""
+    return _arrivals
 
 
 @per_model
 def _loaded(mechanism: MechanismData) -> deque[Any]:
-    """The ``GeneratedTerms`` of a mechanism, once it was asked for."""
+    """The ``GeneratedTerms`` of a mechanism, once they were found."""
     return deque(maxlen=1)
+
+
+def loaded_code(mechanism: Mechanism) -> Any:
+    """The ``GeneratedTerms`` of a mechanism that it has already; None without them."""
+    found = _loaded(mechanism)
+    return found[0] if found else None
 
 
 def load_code(mechanism: Mechanism, compiles: bool = True) -> Any:
@@ -100,8 +126,8 @@ def load_code(mechanism: Mechanism, compiles: bool = True) -> Any:
     """
     found = _loaded(mechanism)
     if not found:
-        structure, parameters = _structure(mechanism)
-        find = _library if compiles else _cached_library
+        structure, parameters = structure_of_mechanism(mechanism)
+        find = _library if compiles else cached_library
         library = find(structure, parameters)
         if library is None:
             return None
@@ -123,40 +149,14 @@ def code_of_record(by: str, mechanism: Mechanism) -> Any:
         return None
 
 
-def code_of_run(by: str, asked: str, mechanism: Mechanism) -> tuple[str, Any]:
-    """Backend of a run of ``mechanism``, and its ``GeneratedTerms`` or None.
-
-    Parameters
-    ----------
-    by
-        From :func:`~srm_mbs.integration.kernel.backend.chosen_backend`.
-    asked
-        The option ``backend``: with ``"auto"``, the kernel runs where there is no code.
-
-    Raises
-    ------
-    InputError
-        If generated code is insisted on and cannot be made.
-    """
-    if by != "generated":
-        return by, None
-    try:
-        return by, load_code(mechanism)
-    except InputError as error:
-        if asked != "auto":
-            raise
-        log.info("the kernel makes this run without generated code: %s", error)
-        return "kernel", None
-
-
 def compile_mechanism(mechanism: Mechanism) -> CompiledMechanism:
     """Load the code of a mechanism, and say how it was made; raises as :func:`load_code`."""
-    structure, parameters = _structure(mechanism)
-    known = structure in _libraries
+    structure, parameters = structure_of_mechanism(mechanism)
+    known = known_library(structure) is not None
     library = _library(structure, parameters)
     load_code(mechanism)
     seconds = 0.0 if known else library.compiled.seconds
-    source = library.source
+    source = source_of_structure(structure)
     return CompiledMechanism(source.operations, seconds, library.compiled.path, source.text)
 
 
@@ -168,10 +168,18 @@ def generated_source(mechanism: Mechanism) -> str:
     InputError
         If it cannot be generated.
     """
-    return _source(_structure(mechanism)[0]).text
+    return source_of_structure(structure_of_mechanism(mechanism)[0]).text
 
 
-def _structure(mechanism: Mechanism) -> tuple[Structure, FloatArray]:
+@per_model
+def structure_of_mechanism(mechanism: Mechanism) -> tuple[Structure, FloatArray]:
+    """Structure and parameters of a mechanism.
+
+    Raises
+    ------
+    InputError
+        If no code can be generated for an element.
+    """
     try:
         return structure_of(mechanism.model, make_system(mechanism).constants())
     except UnsupportedElementError as error:
@@ -186,26 +194,53 @@ def _not_generated(why: str) -> InputError:
     )
 
 
-def _source(structure: Structure) -> Source:
+def source_of_structure(structure: Structure) -> Source:
+    """The C of a structure: some 10 us of CPU time for each statement.
+
+    Raises
+    ------
+    InputError
+        If it cannot be generated.
+    """
+    known = _refused.get(structure)
+    if known is not None:
+        raise _not_generated(known)
     try:
         source = source_of(structure)
+        if source.operations > MOST_OPERATIONS:
+            raise UnsupportedElementError(
+                f"it would have {source.operations} statements, more than {MOST_OPERATIONS}"
+            )
     except UnsupportedElementError as error:
+        _refused[structure] = str(error)
         raise _not_generated(str(error)) from error
-    if source.operations > MOST_OPERATIONS:
-        raise _not_generated(
-            f"it would have {source.operations} statements, more than {MOST_OPERATIONS}"
-        )
     return source
 
 
-def _library(structure: Structure, parameters: FloatArray) -> _Library:
+def identity_of(structure: Structure) -> str:
+    """A text that determines the source of a structure: itself, and the generator."""
+    return f"{_generator()} {structure!r}"
+
+
+@cache
+def _generator() -> str:
+    """The digest of the modules that write a source."""
+    digest = hashlib.sha256()
+    for module in pkgutil.iter_modules([os.path.dirname(__file__)]):
+        if module.name not in _NO_GENERATOR:
+            digest.update(pkgutil.get_data(__package__, f"{module.name}.py") or b"")
+    return digest.hexdigest()
+
+
+def _library(structure: Structure, parameters: FloatArray) -> Library:
     """The code of a structure; ``parameters`` are those of one mechanism of it."""
-    found = _known(structure)
+    found = cached_library(structure, parameters)
     if found is not None:
         return found
-    source = _source(structure)
+    source = source_of_structure(structure)
+    load, identity = _loader(parameters), identity_of(structure)
     try:
-        return _remember(structure, source, *compile_and_load(source.text, _loader(parameters)))
+        return remember(structure, *compile_and_load(source.text, load, identity=identity))
     except CompilationError as error:
         raise InputError(
             f"the generated code cannot be compiled: {error}",
@@ -214,14 +249,38 @@ def _library(structure: Structure, parameters: FloatArray) -> _Library:
         ) from error
 
 
-def _cached_library(structure: Structure, parameters: FloatArray) -> _Library | None:
-    """As :func:`_library`; None where it would have to be compiled."""
-    found = _known(structure)
+def cached_library(structure: Structure, parameters: FloatArray) -> Library | None:
+    """The code of a structure in this process or in the cache; None without it."""
+    found = known_library(structure)
     if found is not None:
         return found
-    source = _source(structure)
-    made = load_cached(source.text, _loader(parameters))
-    return None if made is None else _remember(structure, source, *made)
+    made = load_cached(identity_of(structure), _loader(parameters))
+    return None if made is None else remember(structure, *made)
+
+
+def begin_compilation(structure: Structure, source: Source) -> Compilation | None:
+    """Start the compiler beside the program; None where another process compiles the same.
+
+    Raises
+    ------
+    CompilationError
+        If there is no compiler, or it cannot be started.
+    """
+    identity = identity_of(structure)
+    return Compilation.begin(source.text, identity, PATIENCE, alone=True, background=True)
+
+
+def take_compilation(
+    structure: Structure, parameters: FloatArray, compilation: Compilation
+) -> Library:
+    """The code that the compiler made.
+
+    Raises
+    ------
+    CompilationError
+        If it made none.
+    """
+    return remember(structure, *compilation.load(_loader(parameters)))
 
 
 def _loader(parameters: FloatArray) -> Callable[[Path], Any]:
@@ -236,8 +295,8 @@ def _loader(parameters: FloatArray) -> Callable[[Path], Any]:
     return lambda path: make(str(path), parameters)
 
 
-def _known(structure: Structure) -> _Library | None:
-    """The code of a structure that this process has."""
+def known_library(structure: Structure) -> Library | None:
+    """The code of a structure that this process has; None without it."""
     with _lock:
         found = _libraries.get(structure)
         if found is not None:
@@ -245,9 +304,22 @@ def _known(structure: Structure) -> _Library | None:
         return found
 
 
-def _remember(structure: Structure, source: Source, terms: Any, compiled: Compiled) -> _Library:
+def remember(structure: Structure, terms: Any, compiled: Compiled) -> Library:
+    """Keep the code of a structure in this process."""
+    global _arrivals
     with _lock:
-        _libraries[structure] = library = _Library(source, terms, compiled)
+        _arrivals += 1
+        _libraries[structure] = library = Library(terms, compiled)
         while len(_libraries) > KEPT:
             _libraries.popitem(last=False)
     return library
+
+
+def _new_lock() -> None:
+    """In a fork: a thread that it does not have may have held the lock."""
+    global _lock
+    _lock = Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_new_lock)

@@ -1,14 +1,18 @@
 """Compiles C into shared libraries and keeps them for the user, below the folder for caches.
 
-A library lies under the SHA-256 of its source, the flags, the compiler and the processor; beside it
-lies the SHA-256 of its own bytes, so that what a full disk or a crash left is never loaded.  Files
-appear by renaming, whole or not at all.  The folder belongs to the user alone: others could put
-code there that runs as the user.
+A library lies under the SHA-256 of what determines its source, the flags, the compiler and the
+processor; beside it lies the SHA-256 of its own bytes, so that what a full disk or a crash left is
+never loaded.  Files appear by renaming, whole or not at all.  The folder belongs to the user alone:
+others could put code there that runs as the user.
+
+:func:`compile_and_load` waits for the compiler, :class:`Compilation` lets it work beside the
+program.  No thread does: a program with one must not fork.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import os
 import platform
 import shlex
@@ -23,9 +27,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import IO, NamedTuple, NoReturn, TypeVar
 
 from srm_mbs.errors import get_logger
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 log = get_logger(__name__)
 
@@ -38,6 +47,17 @@ PATIENCE = 120.0
 """Time (s) after which a compiler counts as hanging."""
 _ABANDONED = 3600.0
 """Age (s) of files without a library that no compilation can still be about to rename."""
+
+_COMPILER_FOLDER = "compiler"
+"""Folder of a compiler's own files in the cache."""
+_ZIG_FOLDERS = ("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR")
+_MESSAGES = "messages"
+"""File with what a compiler says."""
+NICENESS = 5
+"""Added to that of the process for compilers in the background: on a core that is busy otherwise
+they get a quarter of it (weights 335 and 1024 of Linux)."""
+_WAIT = 0.02
+"""Time (s) between two looks at what another process compiles."""
 
 Loaded = TypeVar("Loaded")
 
@@ -65,10 +85,13 @@ class Compiler(NamedTuple):
         With the flags that choose the processor.
     identity
         Path, size and time of change of its program.
+    folders
+        Environment variables that name folders of its own.
     """
 
     command: tuple[str, ...]
     identity: str
+    folders: tuple[str, ...] = ()
 
 
 class Compiled(NamedTuple):
@@ -88,17 +111,47 @@ class Compiled(NamedTuple):
 
 @cache
 def compiler() -> Compiler | None:
-    """The C compiler: the environment variable CC, else cc; None without one."""
-    command = shlex.split(os.environ.get("CC", "")) or ["cc"]
-    found = shutil.which(command[0])
-    if found is None:
+    """The C compiler: the environment variable CC, else cc, else that of the package ``ziglang``;
+    None without one."""
+    try:
+        named = shlex.split(os.environ.get("CC", ""))
+    except ValueError:  # an open quotation: no program has this name
         return None
-    program = os.path.realpath(found)
-    state = os.stat(program)
+    command = named or ["cc"]
+    found = shutil.which(command[0])
+    if found is not None and (named or not _offers_installation(found)):
+        return _at(found, command[1:])
+    zig = None if named else _zig()
+    return None if zig is None else _at(zig, ["cc"], _ZIG_FOLDERS)
+
+
+def _at(path: str, arguments: list[str], folders: tuple[str, ...] = ()) -> Compiler | None:
+    """The compiler that the program at ``path`` is."""
+    program = os.path.realpath(path)
+    try:
+        state = os.stat(program)
+    except OSError:
+        return None
     intel = platform.machine().lower() in ("x86_64", "amd64", "i686")
     native = "-march=native" if intel else "-mcpu=native"
     identity = f"{program} {state.st_size} {state.st_mtime_ns}"
-    return Compiler((found, *command[1:], native), identity)
+    return Compiler((path, *arguments, native), identity, folders)
+
+
+def _offers_installation(path: str) -> bool:
+    """Whether this cc of macOS only opens a window that offers to install a compiler."""
+    if sys.platform != "darwin" or path != "/usr/bin/cc":
+        return False
+    command = ["/usr/bin/xcode-select", "--print-path"]
+    return subprocess.run(command, capture_output=True, check=False).returncode != 0
+
+
+def _zig() -> str | None:
+    """The compiler of the package ``ziglang``, if that is installed."""
+    found = importlib.util.find_spec("ziglang")
+    if found is None or found.origin is None:
+        return None
+    return shutil.which("zig", path=os.path.dirname(found.origin))
 
 
 @cache
@@ -158,8 +211,8 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def _key(source: str, chosen: Compiler) -> str:
-    parts = (source, *FLAGS, *chosen.command, chosen.identity, processor())
+def _key(identity: str, chosen: Compiler) -> str:
+    parts = (identity, *FLAGS, *chosen.command, chosen.identity, processor())
     return _digest("\0".join(parts).encode())
 
 
@@ -171,18 +224,29 @@ def _intact(library: Path) -> bool:
         return False
 
 
-def load_cached(source: str, load: Callable[[Path], Loaded]) -> tuple[Loaded, Compiled] | None:
-    """As :func:`compile_and_load`, but None where the cache has no library of ``source``."""
+def keeps_any() -> bool:
+    """Whether the cache has any library, whatever it is: some microseconds."""
+    try:
+        with os.scandir(cache_folder()) as entries:
+            return any(entry.name.endswith(".so") for entry in entries)
+    except (OSError, RuntimeError):  # RuntimeError: no home
+        return False
+
+
+def load_cached(identity: str, load: Callable[[Path], Loaded]) -> tuple[Loaded, Compiled] | None:
+    """As :func:`compile_and_load`, but None where the cache has no library of ``identity``."""
     chosen = compiler()
     folder = None if chosen is None else _usable_folder()
     if chosen is None or folder is None:
         return None
-    library = folder / f"{_key(source, chosen)}.so"
+    library = folder / f"{_key(identity, chosen)}.so"
     if not _intact(library):
         return None
     try:
         loaded = load(library)
     except ValueError:
+        with suppress(OSError):
+            _remove(library.with_suffix(".sha256"))
         return None
     with suppress(OSError):
         os.utime(library)
@@ -190,9 +254,14 @@ def load_cached(source: str, load: Callable[[Path], Loaded]) -> tuple[Loaded, Co
 
 
 def compile_and_load(
-    source: str, load: Callable[[Path], Loaded], patience: float = PATIENCE
+    source: str,
+    load: Callable[[Path], Loaded],
+    patience: float = PATIENCE,
+    identity: str | None = None,
 ) -> tuple[Loaded, Compiled]:
     """The library of ``source``, from the cache or compiled, as ``load`` makes it of its path.
+
+    Where another process compiles it at this time, that one is waited for.
 
     Parameters
     ----------
@@ -202,78 +271,281 @@ def compile_and_load(
         Raises ValueError for a library that cannot be loaded, which is then compiled again.
     patience
         Time (s) that the compiler has.
+    identity
+        Determines ``source``, which it is by default; the library lies under it.
 
     Raises
     ------
     CompilationError
         If there is no compiler, or it fails.
     """
-    chosen = compiler()
-    if chosen is None:
-        raise CompilationError(
-            "there is no C compiler: no program cc was found, and the environment variable CC "
-            "names none",
-            "Install a C compiler",
+    identity = source if identity is None else identity
+    deadline = time.monotonic() + patience
+    while True:
+        found = load_cached(identity, load)
+        if found is not None:
+            return found
+        begun = Compilation.begin(
+            source, identity, patience, alone=time.monotonic() < deadline, background=False
         )
-    found = load_cached(source, load)
-    if found is not None:
-        return found
-    folder, key = _usable_folder(), _key(source, chosen)
-    library = None if folder is None else folder / f"{key}.so"
-    with tempfile.TemporaryDirectory(prefix="srm-mbs-") as made_in:
-        started = time.perf_counter()
-        made = Path(made_in, f"{key}.so")
-        _compile(source, made, chosen, patience)
-        seconds = time.perf_counter() - started
-        kept = None if library is None else _keep(made, library)
+        if begun is not None:
+            break
+        time.sleep(_WAIT)
+    try:
+        begun.wait()
+        return begun.load(load)
+    finally:
+        begun.end()
+
+
+class Compilation:
+    """A compiler at work, in a folder of its own; :meth:`end` has to be called.
+
+    It belongs to the process that began it: a fork takes no part in it.
+    """
+
+    def __init__(self, key: str, library: Path | None, chosen: Compiler) -> None:
+        self._key, self._library, self._compiler = key, library, chosen
+        self._process: subprocess.Popen[bytes] | None = None
+        self._lock_file: IO[bytes] | None = None
+        self._folder: Path | None = None
+        self._owner = os.getpid()
+        self._patience = PATIENCE
+        self._started = time.monotonic()
+        self._seconds = 0.0
+
+    @classmethod
+    def begin(
+        cls, source: str, identity: str, patience: float, *, alone: bool, background: bool
+    ) -> Compilation | None:
+        """Start the compiler.
+
+        Parameters
+        ----------
+        source, identity, patience
+            As for :func:`compile_and_load`.
+        alone
+            Whether None is returned where another process compiles the same, or just has.
+        background
+            Whether it runs at a low priority.  One of this process that does, and compiles the
+            same, is ended by one that does not.
+
+        Raises
+        ------
+        CompilationError
+            If there is no compiler, or it cannot be started.
+        """
+        chosen = compiler()
+        if chosen is None:
+            raise CompilationError(
+                "there is no C compiler: no program cc was found, and the environment variable CC "
+                "names none",
+                "Install a C compiler, or the package ziglang",
+            )
+        folder, key = _usable_folder(), _key(identity, chosen)
+        before = _background.get(key)
+        if before is not None and not background:
+            before.end()
+        made = cls(key, None if folder is None else folder / f"{key}.so", chosen)
+        made._patience = patience
         try:
-            # What is mapped stays there when its file goes.
-            return load(made), Compiled(seconds, kept)
+            if alone and not made._locked():
+                return None
+            if made._lock_file is not None and made._library and _intact(made._library):
+                made.end()
+                return None
+            made._start(made._write_source(source, folder), NICENESS if background else 0)
+        except BaseException:
+            made.end()
+            raise
+        if background:
+            _background[key] = made
+        return made
+
+    def _locked(self) -> bool:
+        """Whether no other process compiles the same: this one is then the one that does."""
+        if self._library is None or fcntl is None:
+            return True
+        path = self._library.with_suffix(".lock")
+        try:
+            file = open(path, "wb")  # noqa: SIM115 - it is open as long as it is locked
+        except OSError:  # a full disk: what follows says so
+            return True
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.close()
+            return False
+        except OSError:  # a file system without locks: the last one to finish is kept
+            file.close()
+            return True
+        self._lock_file = file
+        return True
+
+    def _write_source(self, source: str, folder: Path | None) -> Path:
+        """Write the source into a new folder.
+
+        It lies in the cache, which is cleaned of the folders of killed processes, or where that has
+        no room, elsewhere.
+        """
+        for place, prefix in ((folder, "new-"), (None, "srm-mbs-")):
+            try:
+                self._folder = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
+                (self._folder / f"{self._key}.c").write_text(source)
+                return self._folder
+            except OSError as error:
+                problem = f"the code cannot be written: {error}"
+                if self._folder is not None:
+                    shutil.rmtree(self._folder, ignore_errors=True)
+        raise CompilationError(problem, "Make room for temporary files")
+
+    def _start(self, folder: Path, niceness: int) -> None:
+        """Start the compiler in the ``folder`` of its source."""
+        made, text = (str(folder / f"{self._key}{suffix}") for suffix in (".so", ".c"))
+        command = [*self._compiler.command, *FLAGS, "-o", made, text, "-lm"]
+        own = folder if self._library is None else self._library.with_name(_COMPILER_FOLDER)
+        environment = {name: str(own) for name in self._compiler.folders} | os.environ
+        try:
+            with open(folder / _MESSAGES, "wb") as messages:
+                self._process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=messages,
+                    cwd=folder,
+                    env=environment,
+                    start_new_session=True,
+                )
+        except OSError as error:
+            problem = f"the C compiler {command[0]} cannot be run: {error}"
+            raise CompilationError(problem, "Install a C compiler") from error
+        if niceness:
+            with suppress(OSError):  # it may have ended
+                os.setpriority(os.PRIO_PGRP, self._process.pid, niceness)
+
+    @property
+    def ended(self) -> bool:
+        """Whether :meth:`end` was called."""
+        return self._process is None
+
+    def poll(self) -> bool:
+        """Whether the compiler has ended.
+
+        Raises
+        ------
+        CompilationError
+            As :meth:`wait`.
+        """
+        process = self._process
+        if process is None:
+            return True
+        if process.poll() is not None:
+            self._seconds = time.monotonic() - self._started
+            return True
+        if time.monotonic() - self._started > self._patience:
+            self._hangs()
+        return False
+
+    def wait(self) -> None:
+        """Wait for the compiler.
+
+        Raises
+        ------
+        CompilationError
+            If it does not end in time.
+        """
+        process = self._process
+        if process is None:
+            return
+        left = self._started + self._patience - time.monotonic()
+        try:
+            process.wait(max(left, 0.0))
+        except subprocess.TimeoutExpired:
+            self._hangs()
+        self._seconds = time.monotonic() - self._started
+
+    def _hangs(self) -> NoReturn:
+        self.end()
+        name = self._compiler.command[0]
+        problem = f"the C compiler {name} made nothing within {self._patience:g} s"
+        raise CompilationError(problem, "Use another C compiler")
+
+    def load(self, load: Callable[[Path], Loaded]) -> tuple[Loaded, Compiled]:
+        """The library, copied into the cache.
+
+        Raises
+        ------
+        CompilationError
+            If the compiler failed, or was ended.
+        """
+        name, process, folder = self._compiler.command[0], self._process, self._folder
+        if process is None or folder is None:
+            raise CompilationError(f"the C compiler {name} was ended", "Compile it again")
+        made = folder / f"{self._key}.so"
+        if process.returncode or not made.is_file():
+            said = _last_line(folder / _MESSAGES)
+            raise CompilationError(
+                f"the C compiler {name} failed: {said}", "Use another C compiler"
+            )
+        kept = None if self._library is None else _keep(made, self._library)
+        try:
+            # From here: dlopen takes what it has of the path of a library that was damaged.  What
+            # is mapped stays there when its file goes.
+            return load(made), Compiled(self._seconds, kept)
         except ValueError as error:
-            problem = f"the code that {chosen.command[0]} made cannot be loaded: {error}"
+            problem = f"the code that {name} made cannot be loaded: {error}"
             raise CompilationError(problem, "Use another C compiler") from error
 
+    def end(self) -> None:
+        """End the compiler, if it is at work, and remove its folder."""
+        _background.pop(self._key, None)
+        process, folder, file = self._process, self._folder, self._lock_file
+        self._process = self._folder = self._lock_file = None
+        if self._owner != os.getpid():
+            if process is not None and process.returncode is None:
+                process.returncode = 0  # the fork's: its collection would warn
+            return
+        if process is not None and process.returncode is None:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # compilers start others
+            process.wait()
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        if file is not None:
+            with suppress(OSError):
+                os.unlink(file.name)
+            # Forks have the file open, too.
+            fcntl.flock(file, fcntl.LOCK_UN)
+            file.close()
 
-def _compile(source: str, made: Path, chosen: Compiler, patience: float) -> None:
-    """Compile ``source`` into the library ``made``."""
-    text = made.with_suffix(".c")
-    text.write_text(source)
-    command = [*chosen.command, *FLAGS, "-o", str(made), str(text), "-lm"]
-    name = chosen.command[0]
+
+_background: dict[str, Compilation] = {}
+"""Compilations in the background of this process."""
+
+
+def end_background() -> None:
+    """End all compilations in the background of this process."""
+    for compilation in list(_background.values()):
+        compilation.end()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=end_background)
+
+
+def _last_line(path: Path) -> str:
+    """The last line of a file that is not empty."""
     try:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            cwd=made.parent,
-            start_new_session=True,
-        )
-    except OSError as error:
-        problem = f"the C compiler {name} cannot be run: {error}"
-        raise CompilationError(problem, "Install a C compiler") from error
-    try:
-        _, said = process.communicate(timeout=patience)
-    except BaseException as error:
-        # Compilers start others, which would go on.
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-        if isinstance(error, subprocess.TimeoutExpired):
-            problem = f"the C compiler {name} made nothing within {patience:g} s"
-            raise CompilationError(problem, "Use another C compiler") from error
-        raise
-    if process.returncode or not made.is_file():
-        last = next((line for line in reversed(said.splitlines()) if line.strip()), "no message")
-        raise CompilationError(f"the C compiler {name} failed: {last}", "Use another C compiler")
+        lines = path.read_text(errors="replace").splitlines()
+    except OSError:
+        lines = []
+    return next((line for line in reversed(lines) if line.strip()), "no message")
 
 
 def _keep(made: Path, library: Path) -> Path | None:
     """Copy a new library into the cache; where it lies there, or None if it could not be."""
-    content = made.read_bytes()
     try:
+        content = made.read_bytes()
         _write(library, content)
         _write(library.with_suffix(".sha256"), _digest(content).encode())
         _shrink(library.parent)
@@ -305,18 +577,22 @@ def _shrink(folder: Path) -> None:
             if path.suffix == ".so":
                 found.append((state.st_mtime, state.st_size, path))
             elif path.name.startswith("new-") and time.time() - state.st_mtime > _ABANDONED:
-                path.unlink()
+                _remove(path)
     total = sum(size for _, size, _ in found)
     for _, size, path in sorted(found):
         if total <= LARGEST:
             return
+        _remove(path.with_suffix(".sha256"))
         _remove(path)
         total -= size
 
 
-def _remove(library: Path) -> None:
-    for path in (library.with_suffix(".sha256"), library):
-        with suppress(FileNotFoundError):
+def _remove(path: Path) -> None:
+    """Remove a file, or a folder with all that is in it."""
+    with suppress(FileNotFoundError):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
             path.unlink()
 
 
@@ -333,12 +609,18 @@ def clear() -> tuple[int, int]:
     if not folder.is_dir():
         return 0, 0
     for path in folder.iterdir():
-        if path.suffix not in (".so", ".sha256") and not path.name.startswith("new-"):
-            continue
-        size += path.lstat().st_size
-        count += path.suffix == ".so"
-        path.unlink()
+        own = path.suffix in (".so", ".sha256", ".lock") or path.name == _COMPILER_FOLDER
+        if own or path.name.startswith("new-"):
+            size += _size(path)
+            count += path.suffix == ".so"
+            _remove(path)
     return count, size
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file, or of all files of a folder."""
+    files = path.rglob("*") if path.is_dir() else (path,)
+    return sum(file.lstat().st_size for file in files if not file.is_dir())
 
 
 def contents() -> tuple[int, int]:

@@ -10,8 +10,11 @@ from functools import cache
 
 from srm_mbs._kernel import core, missing, remedy
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError, get_logger, safe_repr, warn
+from srm_mbs.integration.generated.code import source_of_structure, structure_of_mechanism
 from srm_mbs.integration.generated.code_cache import compiler
+from srm_mbs.integration.generated.policy import code_at_hand, compile_seconds
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.psrm import PSRM
 
@@ -24,26 +27,71 @@ PLACEMENTS = ("automatic", "off")
 """Those that the kernel has."""
 
 
-def backend() -> str:
+def backend(mechanism: Mechanism | None = None) -> str:
     """The backend that ``backend="auto"`` takes where it can: ``"kernel"``, ``"python"`` or
     ``"generated"``.
 
     ``"python"`` where there is no kernel (``srm-mbs info`` says why), or where the environment
-    variable SRM_MBS_BACKEND is ``python``; ``"generated"`` where that variable is ``generated`` and
-    there is a C compiler.
+    variable SRM_MBS_BACKEND is ``python``.
+
+    Parameters
+    ----------
+    mechanism
+        For its next run: ``"generated"`` if its code was compiled, and SRM_MBS_BACKEND is not
+        ``kernel``.  Without a mechanism, ``"generated"`` only where that variable is ``generated``
+        and there is a C compiler, so that code is compiled for every run.
+
+    Raises
+    ------
+    InputError
+        If SRM_MBS_BACKEND names no backend.
     """
-    if core is None or _unwanted():
+    asked = _of_environment()
+    if core is None or asked == "python":
         return "python"
-    return "generated" if generated_wanted() else "kernel"
+    if asked == "generated" and compiler() is not None:
+        return "generated"
+    found = None if mechanism is None or asked == "kernel" else code_at_hand(mechanism)
+    return "kernel" if found is None else "generated"
 
 
-def generated_wanted() -> bool:
-    """Whether runs with ``backend="auto"`` take generated code where they can."""
-    return os.environ.get("SRM_MBS_BACKEND") == "generated" and compiler() is not None
+def _of_environment() -> str:
+    """The backend of runs with ``backend="auto"``, as the environment has it."""
+    asked = os.environ.get("SRM_MBS_BACKEND") or "auto"
+    if asked not in BACKENDS:
+        raise InputError(
+            f"the environment variable SRM_MBS_BACKEND = {safe_repr(asked)} names no backend",
+            element="backend",
+            remedy=f"Known: {', '.join(BACKENDS)}",
+        )
+    return asked
 
 
-def _unwanted() -> bool:
-    return os.environ.get("SRM_MBS_BACKEND") == "python"
+def code_is_compiled() -> bool:
+    """Whether code of mechanisms is compiled for runs with ``backend="auto"`` to come."""
+    return _of_environment() == "auto" and compiler() is not None
+
+
+def code_status(mechanism: Mechanism) -> str | None:
+    """Whether a mechanism has generated code, or why not; None where runs are made in Python."""
+    asked = _of_environment()
+    if core is None or asked == "python":
+        return None
+    if asked == "kernel":
+        return "not taken, because SRM_MBS_BACKEND is kernel"
+    if code_at_hand(mechanism) is not None:
+        return "compiled"
+    if compiler() is None:
+        return "none: there is no C compiler"
+    try:
+        statements = source_of_structure(structure_of_mechanism(mechanism)[0]).operations
+    except InputError as error:
+        return f"none: {error.problem}"
+    if asked == "generated":
+        return "compiled by the next run"
+    return (
+        f"compiled once runs have used {compile_seconds(statements):.2g} s, or by srm-mbs compile"
+    )
 
 
 def check_kernel() -> None:
@@ -58,7 +106,7 @@ def check_kernel() -> None:
         raise InputError(
             f"the compiled kernel is not available: {missing}", element="backend", remedy=remedy
         )
-    if _unwanted():
+    if _of_environment() == "python":
         raise InputError(
             "the environment variable SRM_MBS_BACKEND asks for the Python reference",
             element="backend",
@@ -78,11 +126,16 @@ def unsupported_reason(method: Method, placement: str, singular_times: FloatArra
 
 
 def chosen_backend(asked: str, method: Method, placement: str, singular_times: FloatArray) -> str:
-    """The backend of a run with ``backend=asked``: ``"python"``, ``"kernel"``, or ``"generated"``;
-    the last one for ``"auto"``, too, where it is wanted and the mechanism allows it
-    (:func:`~srm_mbs.integration.generated.code.code_of_run`).
+    """The backend of a run with ``backend=asked``, for
+    :func:`~srm_mbs.integration.generated.policy.code_of_run`.
 
     Warns, once per process, where the kernel would make the run if it were available.
+
+    Returns
+    -------
+    str
+        ``"python"``, ``"kernel"``, ``"generated"``; or ``"auto"``: generated code, if the mechanism
+        has it, else the kernel.
 
     Raises
     ------
@@ -95,7 +148,8 @@ def chosen_backend(asked: str, method: Method, placement: str, singular_times: F
             element="backend",
             remedy=f"Known: {', '.join(BACKENDS)}",
         )
-    if asked == "python" or (asked == "auto" and _unwanted()):
+    wanted = _of_environment() if asked == "auto" else asked
+    if wanted == "python":
         return "python"
     lacking = unsupported_reason(method, placement, singular_times)
     if asked in COMPILED and (lacking or core is None):
@@ -111,9 +165,9 @@ def chosen_backend(asked: str, method: Method, placement: str, singular_times: F
         warn_missing()
     if core is None or lacking:
         return "python"
-    if asked != "auto":
-        return asked
-    return "generated" if generated_wanted() else "kernel"
+    if wanted == "generated" and asked == "auto" and compiler() is None:
+        return "kernel"
+    return wanted
 
 
 @cache

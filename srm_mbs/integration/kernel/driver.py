@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,6 +71,7 @@ def integrate(
     passing: BreakpointHandler | None = None,
     passages: CriticalPassages | None = None,
     sink: StepSink | None = None,
+    meter: Callable[[], None] | None = None,
 ) -> CompiledRecord:
     """As :func:`srm_mbs.integration.driver.integrate`, on the kernel.
 
@@ -87,6 +88,8 @@ def integrate(
         Takes the passages of critical configurations that the kernel examined.
     sink
         Takes the steps; they remain in the record without one.
+    meter
+        Called whenever the kernel returns, which is at least every CHUNK seconds.
     """
     t_start, start = run.t0, run.start
     record = CompiledRecord(run.t0, start, run=run)
@@ -104,6 +107,8 @@ def integrate(
             stride = getattr(tick, "stride", 1) if events is None else 1  # a tick may change it
             block = 0 if sink is None else sink.block - made
             reason = run.advance(stride if one_by_one else block)
+            if meter is not None:
+                meter()
             if reason is ReturnReason.BREAKPOINT and passing is not None:
                 run.pass_breakpoint(passing)
                 continue

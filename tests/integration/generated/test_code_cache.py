@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import srm_mbs as srm
@@ -109,6 +110,16 @@ def test_the_cache_alone_compiles_nothing() -> None:
     assert (found[0], found[1].seconds) == (7, 0.0)
 
 
+def test_an_intact_library_that_cannot_be_loaded_is_compiled_again(folder: Path) -> None:
+    path = compile_and_load(SEVEN, _seven)[1].path
+    assert path is not None
+    path.write_bytes(b"of another system")
+    path.with_suffix(".sha256").write_text(code_cache._digest(b"of another system"))
+    value, made = compile_and_load(SEVEN, _seven)
+    assert (value, made.seconds > 0.0) == (7, True)
+    assert compile_and_load(SEVEN, _seven)[1].seconds == 0.0
+
+
 @pytest.mark.parametrize("damage", ["truncated", "changed", "empty", "no digest"])
 def test_a_damaged_library_is_compiled_again(folder: Path, damage: str) -> None:
     path = compile_and_load(SEVEN, _seven)[1].path
@@ -170,10 +181,62 @@ def test_the_cache_keeps_what_was_used_last(folder: Path, monkeypatch: pytest.Mo
 
 def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(code_cache, "compiler", code_cache.compiler.__wrapped__)
+    monkeypatch.setattr(code_cache, "_zig", lambda: None)
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(CompilationError, match="there is no C compiler"):
         compile_and_load(SEVEN, _seven)
+
+
+@pytest.mark.parametrize("named", ["nothing-of-this-name", "'an open quotation"])
+def test_a_compiler_that_the_environment_names_and_that_is_not_there_is_not_replaced(
+    monkeypatch: pytest.MonkeyPatch, named: str
+) -> None:
+    monkeypatch.setenv("CC", named)
+    assert code_cache.compiler.__wrapped__() is None
+
+
+def test_without_cc_the_compiler_of_the_package_ziglang_is_taken(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, folder: Path
+) -> None:
+    """Its cc takes the same options; a script in its place, because it has 400 MB."""
+    zig, seen = tmp_path / "zig", tmp_path / "seen"
+    script = f'echo "$1 $ZIG_GLOBAL_CACHE_DIR" >> {seen}; shift; exec {shutil.which("cc")} "$@"'
+    _write_program(zig, script)
+    monkeypatch.setattr(code_cache, "_zig", lambda: str(zig))
+    usual = code_cache.compiler.__wrapped__()
+    assert Path(usual.command[0]).name == "cc"
+    monkeypatch.setattr(code_cache, "compiler", code_cache.compiler.__wrapped__)
+    which = shutil.which
+    monkeypatch.setattr(shutil, "which", lambda name, **more: None if name == "cc" else which(name))
+    monkeypatch.delenv("ZIG_GLOBAL_CACHE_DIR", raising=False)
+    assert compile_and_load(SEVEN, _seven)[0] == 7
+    assert seen.read_text() == f"cc {folder / 'compiler'}\n"
+    # What it keeps there goes with the code.
+    (folder / "compiler").mkdir()
+    (folder / "compiler" / "libc").write_text("12345")
+    assert code_cache.clear()[0] == 1
+    assert not list(folder.iterdir())
+
+
+@pytest.mark.stress
+def test_code_of_the_package_ziglang_computes_what_that_of_cc_does(
+    monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> None:
+    pytest.importorskip("ziglang", reason="ziglang is not installed")
+    mechanism = srm.load("four_bar")
+    expected = srm.simulate(mechanism, 2.0, backend="generated")
+    script = (
+        "import srm_mbs as srm; s = srm.simulate(srm.load('four_bar'), 2.0, backend='generated');"
+        "print(s.settings.backend, *s.q[-1])"
+    )
+    hidden = os.environ | {"PATH": str(folder)}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=hidden, capture_output=True, text=True, check=True
+    )
+    by, *q = done.stdout.split()
+    assert by == "generated"
+    assert np.abs(np.array(q, dtype=float) - expected.q[-1]).max() < 1e-9
 
 
 def test_the_last_line_of_a_compiler_that_fails_is_the_reason(program: Path) -> None:

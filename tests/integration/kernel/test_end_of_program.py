@@ -12,7 +12,7 @@ from srm_mbs.integration.kernel import backend
 
 pytestmark = pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}")
 
-KERNEL = {name: value for name, value in os.environ.items() if name != "SRM_MBS_BACKEND"}
+KERNEL = os.environ | {"SRM_MBS_BACKEND": "kernel"}
 """Environment of programs whose runs the kernel makes, whatever backend the tests are for."""
 PROGRAM = """
 import threading, time

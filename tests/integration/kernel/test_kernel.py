@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 import weakref
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -312,11 +313,17 @@ def test_the_backend_is_named_and_can_be_chosen(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setenv("SRM_MBS_BACKEND", "python")
     assert srm.backend() == "python"
     assert srm.simulate(load("four_bar"), 0.1).settings.backend == "python"
-    monkeypatch.delenv("SRM_MBS_BACKEND")
+    monkeypatch.setenv("SRM_MBS_BACKEND", "kernel")
     assert srm.backend() == "kernel"
     assert srm.simulate(load("four_bar"), 0.1).settings.backend == "kernel"
+    monkeypatch.delenv("SRM_MBS_BACKEND")
+    assert srm.backend() == "kernel"
     assert srm.simulate(load("four_bar"), 0.1, backend="python").settings.backend == "python"
     assert srm.simulate(load("four_bar"), 0.1, method="srm").settings.backend == "python"
+    monkeypatch.setenv("SRM_MBS_BACKEND", "kernl")
+    for asks in (srm.backend, partial(srm.simulate, load("four_bar"), 0.1)):
+        with pytest.raises(srm.InputError, match="SRM_MBS_BACKEND = 'kernl' names no backend"):
+            asks()
 
 
 @pytest.mark.parametrize("name", [name for name, _ in MODELS])

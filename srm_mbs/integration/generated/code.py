@@ -23,12 +23,12 @@ from srm_mbs.integration.generated.code_cache import (
     compile_and_load,
     load_cached,
 )
+from srm_mbs.integration.generated.source import Source, source_of
 from srm_mbs.integration.generated.structure import (
     Structure,
     UnsupportedElementError,
     structure_of,
 )
-from srm_mbs.integration.generated.terms import Source, source_of
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 log = get_logger(__name__)

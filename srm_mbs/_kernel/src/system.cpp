@@ -662,7 +662,8 @@ void System::generated_terms(double t, const double* state, ForceLaws* laws) {
     }
     add_bushings(data_.forces, w, bushings_, lawful, laws);
     if (joined) {
-        const double* acting = laws_.applied ? laws_.applied : joined_.data();
+        joined_act_ = !laws_.applied;
+        const double* acting = joined_act_ ? joined_.data() : laws_.applied;
         for (int i = 0; i < nv; ++i) f_[i] += acting[i];
     }
     for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
@@ -762,17 +763,12 @@ void System::acceleration_of(double* r, const double* c) {
     projection_->unwhiten(r);
 }
 
-// Damping and friction by their rates, in of_laws (count, 2 nv).
-void System::passive_laws_by_rates(double* of_laws) const {
-    for (int i = 0; i < nv; ++i) {
-        const int law = laws_.of_coordinate(i);
-        if (law < 0) continue;
-        double& slope = of_laws[(nv + i) * laws_.count() + law];
-        if (!data_.damping.empty()) slope -= data_.damping[i];
-        if (data_.friction.empty()) continue;
-        const double share = std::tanh(v_[i] / data_.friction_speed);
-        slope -= data_.friction[i] / data_.friction_speed * (1.0 - share * share);
-    }
+// The derivative of damping and friction of a coordinate by its rate.
+double System::passive_slope(int i) const {
+    double out = data_.damping.empty() ? 0.0 : -data_.damping[i];
+    if (data_.friction.empty()) return out;
+    const double share = std::tanh(v_[i] / data_.friction_speed);
+    return out - data_.friction[i] / data_.friction_speed * (1.0 - share * share);
 }
 
 // Adds to Dr_ what the controller contributes.
@@ -789,12 +785,22 @@ void System::controller_by_state(double t, const double* state, const std::vecto
     }
 }
 
+// The generated derivatives with these accelerations (nv,), multipliers (rows,) and laws of elements.
+void System::generated_derivatives(const double* state, const double* a, const double* lam,
+                                   const double* applied) {
+    for (auto* zeroed : {&Dr_, &Dc_, &Dl_, &Dq_, &Dv_})
+        std::fill(zeroed->begin(), zeroed->end(), 0.0);
+    code_->linearise(state, state + nq, law_values_.data(), a, lam, applied, turns_.data(),
+                     Dr_.data(), Dc_.data(), Dl_.data(), Dq_.data(), Dv_.data());
+}
+
 bool System::linearise(double t, const double* state, const double* a,
                        const std::vector<double>& steps, double* by_q, double* by_v,
                        double* by_laws, double* of_laws) {
-    if (!code_ || !code_->linearises() || !joined_.empty() || rank_deficient()) return false;
+    if (!code_ || !code_->linearises() || rank_deficient()) return false;
+    const bool joined = !joined_.empty();
+    if (joined && !turns_.empty()) return false;
     auto& w = *work_;
-    const int first = laws_.first_of_elements(), m = laws_.count(), held = m - first;
     if (closed_) {
         white_ = projection_->white_multiplier;
         projection_->multiplier(white_.data(), multipliers_.data());
@@ -803,36 +809,82 @@ bool System::linearise(double t, const double* state, const double* a,
         factorise_mass();
     }
     bushing_turns(data_.forces, w, bushings_, turns_.data());
-    for (auto* zeroed : {&Dr_, &Dc_, &Dl_, &Dq_, &Dv_})
-        std::fill(zeroed->begin(), zeroed->end(), 0.0);
-    code_->linearise(state, state + nq, law_values_.data(), a, multipliers_.data(),
-                     laws_.applied ? laws_.applied + first : nullptr, turns_.data(), Dr_.data(),
-                     Dc_.data(), Dl_.data(), Dq_.data(), Dv_.data());
+    if (joined) joined_laws_by_state(state, a, of_laws);
+    const int first = joined ? 0 : laws_.first_of_elements();
+    const std::vector<double> none(code_->held());
+    const double* const applied =
+        joined || !laws_.applied ? none.data() : laws_.applied + first;
+    generated_derivatives(state, a, multipliers_.data(), applied);
     if (controller_) controller_by_state(t, state, steps);
     for (int j = 0; j < 2 * nv; ++j) {
         double* const column = j < nv ? by_q + j * nv : by_v + (j - nv) * nv;
         std::copy_n(&Dr_[j * nv], nv, column);
         acceleration_of(column, closed_ ? &Dc_[j * data_.rows] : nullptr);
-        double* const laws = of_laws + j * m;
-        std::fill_n(laws, first, 0.0);
-        std::copy_n(Dl_.begin() + j * held, held, laws + first);
+    }
+    const int m = laws_.count();
+    for (int k = 0; k < m; ++k) {
+        double* const column = by_laws + k * nv;
+        if (joined || k < first) {
+            std::fill_n(column, nv, 0.0);
+        } else {
+            std::copy_n(&Dr_[(2 * nv + k - first) * nv], nv, column);
+            acceleration_of(column, nullptr);
+        }
+    }
+    for (int i = 0; i < nv; ++i)
+        if (const int law = joined ? i : laws_.of_coordinate(i); law >= 0) {
+            by_laws[law * nv + i] = -1.0;
+            acceleration_of(by_laws + law * nv, nullptr);
+        }
+    if (joined) return true;
+    for (int j = 0; j < 2 * nv; ++j) {
+        std::fill_n(of_laws + j * m, first, 0.0);
+        std::copy_n(Dl_.begin() + j * (m - first), m - first, of_laws + j * m + first);
     }
     for (int i = 0; i < nv; ++i)
         if (const int law = laws_.of_coordinate(i); law >= 0) {
             of_laws[i * m + law] = Dq_[i];
-            of_laws[(nv + i) * m + law] = Dv_[i];
-            double* const column = by_laws + law * nv;
-            std::fill_n(column, nv, 0.0);
-            column[i] = -1.0;
-            acceleration_of(column, nullptr);
+            of_laws[(nv + i) * m + law] = Dv_[i] + passive_slope(i);
         }
-    for (int e = 0; e < held; ++e) {
-        double* const column = by_laws + (first + e) * nv;
-        std::copy_n(&Dr_[(2 * nv + e) * nv], nv, column);
-        acceleration_of(column, nullptr);
-    }
-    passive_laws_by_rates(of_laws);
     return true;
+}
+
+// Derivatives (nv, 2 nv) of joined laws z = M u with M u + G^T mu = F and G u = 0, F the forces of
+// the laws (nv,): those of M u + G^T mu and of G u are what derivatives with a + u and lam + mu
+// have in addition to those with a and lam, because they are linear in these.
+void System::joined_laws_by_state(const double* state, const double* a, double* out) {
+    const int rows = data_.rows, held = code_->held();
+    const std::size_t n = nv, columns = 2 * n;
+    std::vector<double> u(joined_), mu(rows), accelerations(a, a + nv);
+    projection_->whiten_force(u.data());
+    projection_->multiplier(u.data(), mu.data());
+    projection_->remove_normal(u.data());
+    projection_->unwhiten(u.data());
+    const std::vector<double> none(held);
+    // What acts from now on is z, of which the closures take up nothing.
+    if (joined_act_)
+        for (int i = 0; i < rows; ++i) multipliers_[i] -= mu[i];
+    std::vector<double> multipliers(multipliers_);
+    generated_derivatives(state, accelerations.data(), multipliers.data(), none.data());
+    const std::vector<double> r(Dr_), c(Dc_);
+    for (int i = 0; i < nv; ++i) accelerations[i] += u[i];
+    generated_derivatives(state, accelerations.data(), multipliers.data(), none.data());
+    for (std::size_t i = 0; i < columns * n; ++i) out[i] = Dr_[i] - r[i];  // dM u
+    for (int i = 0; i < rows; ++i) multipliers[i] += mu[i];
+    generated_derivatives(state, accelerations.data(), multipliers.data(), held_values_.data());
+    std::vector<double> change(n), moved(n), rows_change(rows);
+    for (std::size_t j = 0; j < columns; ++j) {
+        for (std::size_t i = 0; i < n; ++i) change[i] = Dr_[j * n + i] - r[j * n + i];
+        for (int e = 0; e < held; ++e)
+            add(Dl_[j * held + e], &Dr_[(columns + e) * n], change.data(), nv);
+        const std::size_t i = j % n;
+        change[i] -= j < n ? Dq_[i] : Dv_[i] + passive_slope(static_cast<int>(i));
+        for (int row = 0; row < rows; ++row)
+            rows_change[row] = Dc_[j * rows + row] - c[j * rows + row];
+        acceleration_of(change.data(), rows_change.data());
+        mass_times(change.data(), moved.data());
+        for (std::size_t k = 0; k < n; ++k) out[j * n + k] += moved[k];
+    }
 }
 
 void System::evaluate(double t, const double* state, const ZoneView& zone) {

@@ -306,7 +306,10 @@ private:
     void generated_terms(double t, const double* state, ForceLaws* laws);
     void passive_joined();
     void acceleration_of(double* r, const double* c);
-    void passive_laws_by_rates(double* of_laws) const;
+    double passive_slope(int i) const;
+    void generated_derivatives(const double* state, const double* a, const double* lam,
+                               const double* applied);
+    void joined_laws_by_state(const double* state, const double* a, double* out);
     void controller_by_state(double t, const double* state, const std::vector<double>& steps);
     const GeneratedTerms* code_ = nullptr;
     std::unique_ptr<Projection> generated_projection_;  // or the other one, while it is in use
@@ -322,6 +325,7 @@ private:
     // Elements with laws, and the others, where the laws are joined.
     std::vector<ForceElement> lawful_, lawless_;
     std::vector<double> joined_;  // (nv,), generalised forces of joined laws; empty: they are not
+    bool joined_act_ = false;     // these themselves, at the stage that code evaluated last
     std::vector<double> factors_;  // (nv, nv), of M of an open tree
     std::vector<int> pivots_;
     bool tracks_laws_ = false;

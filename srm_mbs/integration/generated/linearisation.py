@@ -28,8 +28,8 @@ from srm_mbs.integration.generated.differentiation import (
     derivatives,
 )
 from srm_mbs.integration.generated.expressions import Expression, Output, write_c
-from srm_mbs.integration.generated.structure import Bushing, Structure
-from srm_mbs.integration.generated.terms import FORCE_KINDS, ON_COORDINATES, Row, Trace
+from srm_mbs.integration.generated.structure import ZERO, Bushing, Structure
+from srm_mbs.integration.generated.terms import Row, Trace
 from srm_mbs.integration.generated.vectors import (
     Vector,
     add,
@@ -41,9 +41,9 @@ from srm_mbs.integration.generated.vectors import (
     transposed,
 )
 
-MOST_STATEMENTS = 6000
-"""Statements of derivatives, as :func:`~srm_mbs.integration.generated.differentiation.
-count_derivatives` estimates them, up to which they are generated."""
+MOST_STATEMENTS = 8000
+"""Statements of derivatives, as :func:`count_derivatives` estimates them, up to which they are
+generated: they compile in 1 to 3 s."""
 TURN_SIZE = 5
 """Numbers of each bushing: phi (3), c, and the derivative of c by the square of phi."""
 
@@ -146,16 +146,15 @@ _NONE = Linearisation("", 0, 0)
 def linearisation_of(structure: Structure) -> Linearisation:
     """The C of ``srm_mbs_linear_constants`` and ``srm_mbs_linearise``.
 
-    The text is empty where nothing makes steps stiff, and where there would be more than
-    MOST_STATEMENTS.
+    The text is empty where nothing damps, because steps are then not stiff, and where there would
+    be more than MOST_STATEMENTS.
 
     Raises
     ------
     ZeroDivisionError
         If two points of an element coincide in every configuration.
     """
-    on_coordinates = any(FORCE_KINDS[force.kind] in ON_COORDINATES for force in structure.forces)
-    if not (structure.passive or structure.held or on_coordinates):
+    if not _damped(structure):
         return _NONE
     trace = _Residual(structure)
     trace.record()
@@ -179,6 +178,14 @@ def linearisation_of(structure: Structure) -> Linearisation:
     written = write_c([out for out in outputs if not out.value.is_zero])
     text = _TEMPLATE.format(constants=written.constants, terms=written.terms)
     return Linearisation(text, written.constant_count, written.operations)
+
+
+def _damped(structure: Structure) -> bool:
+    """Whether damping or friction acts on a coordinate, or an element damps."""
+    dampers = [force.coefficients.start + 1 for force in structure.forces]
+    for bushing in structure.bushings:
+        dampers += range(bushing.coefficients.start + 6, bushing.coefficients.start + 12)
+    return structure.passive or any(structure.codes[place] != ZERO for place in dampers)
 
 
 _TEMPLATE = """

@@ -34,12 +34,11 @@ pytestmark = [
 
 
 def _chain(*closures: srm.LoopClosure, forces: tuple[Any, ...] = ()) -> srm.Mechanism:
-    """A planar joint, a hinge, a ball joint and a slider, one after the other."""
+    """A hinge, a ball joint and a slider, one after the other."""
     rng = np.random.default_rng(5)
     model = pin.Model()
     joint = 0
-    kinds = [pin.JointModelPlanar(), pin.JointModelRX(), pin.JointModelSpherical()]
-    for i, kind in enumerate([*kinds, pin.JointModelPY()]):
+    for i, kind in enumerate([pin.JointModelRX(), pin.JointModelSpherical(), pin.JointModelPY()]):
         at = pin.SE3(pin.rpy.rpyToMatrix(rng.uniform(-1, 1, 3)), rng.uniform(-1, 1, 3))
         joint = model.addJoint(joint, kind, at, f"j{i}")
         body = rod(rng.uniform(0.5, 2.0))
@@ -50,30 +49,30 @@ def _chain(*closures: srm.LoopClosure, forces: tuple[Any, ...] = ()) -> srm.Mech
     return srm.Mechanism(model, closures, q0=pin.neutral(model), forces=forces)
 
 
-_TIP = srm.Anchor("body_3", xyz=(0.1, 0.2, 0.3), rpy=(0.1, -0.4, 0.2))
+_TIP = srm.Anchor("body_2", xyz=(0.1, 0.2, 0.3), rpy=(0.1, -0.4, 0.2))
 _ROOT = srm.Anchor("body_0", xyz=(0.3, 0.0, 0.1), rpy=(0.3, 0.0, 0.1))
 _SLOTTED = srm.LoopClosure("point_on_plane", _TIP, srm.Anchor("world"), axis=(0.6, 0.0, 0.8))
-_CAM = srm.LoopClosure("coupling", joints=("j1", "j3"), polynomial=(0.1, -0.7, 0.3, 0.2))
+_CAM = srm.LoopClosure("coupling", joints=("j0", "j2"), polynomial=(0.1, -0.7, 0.3, 0.2))
 FORCES = (
     srm.Bushing(
         _TIP,
         _ROOT,
-        stiffness=(10.0, 20.0, 30.0, 1.0, 2.0, 3.0),
-        damping=(1.0, 2.0, 3.0, 0.1, 0.2, 0.3),
+        stiffness=(10.0, 0.0, 0.0, 1.0, 0.0, 3.0),
+        damping=(1.0, 0.0, 0.0, 0.1, 0.0, 0.3),
     ),
     srm.SpringDamper(_TIP, _ROOT, stiffness=40.0, damping=3.0, rest_length=0.7),
 )
 OTHER_FORCES = (
     srm.SpringDamper(_TIP, srm.Anchor("world"), stiffness=40.0, damping=3.0, rest_length=0.0),
     srm.Wrench(
-        srm.Anchor("body_2", xyz=(0.1, 0.0, 0.0)),
+        srm.Anchor("body_1", xyz=(0.1, 0.0, 0.0)),
         force=(1.0, 2.0, 3.0),
         moment=(0.5, -1.0, 2.0),
         frame="link",
         law=srm.Sine(1.0, frequency_hz=2.0),
     ),
-    srm.TorsionSpring("j1", stiffness=4.0, damping=0.3, rest_angle=0.2),
-    srm.LimitSpring("j3", lower=-0.3, upper=0.2, stiffness=50.0, damping=2.0, depth=0.4),
+    srm.TorsionSpring("j0", stiffness=4.0, damping=0.3, rest_angle=0.2),
+    srm.LimitSpring("j2", lower=-0.3, upper=0.2, stiffness=50.0, damping=2.0, depth=0.4),
     srm.Bushing(_TIP, srm.Anchor("world"), stiffness=(0.0, 9.0, 0.0, 0.0, 2.0, 0.0)),
 )
 
@@ -85,6 +84,28 @@ def _damped(mechanism: srm.Mechanism, name: str) -> srm.Mechanism:
     return replace(mechanism, model=model, friction_speed=0.7)
 
 
+def _damped_everywhere(mechanism: srm.Mechanism, *forces: Any) -> srm.Mechanism:
+    """More laws than the closures leave degrees of freedom: they are joined."""
+    model = mechanism.model.copy()
+    model.damping, model.friction = np.linspace(1.0, 3.0, model.nv), np.full(model.nv, 0.5)
+    return replace(mechanism, model=model, forces=forces, friction_speed=0.7)
+
+
+def _damped_four_bar() -> srm.Mechanism:
+    mechanism = load("four_bar")
+    return _damped_everywhere(
+        mechanism,
+        srm.SpringDamper(
+            srm.Anchor("coupler", xyz=(0.7, 0.0, 0.2)),
+            srm.Anchor("world", xyz=(0.3, 0.0, 2.5)),
+            stiffness=40.0,
+            damping=3.0,
+            rest_length=0.7,
+        ),
+        srm.TorsionSpring(mechanism.joint_names[0], stiffness=4.0, damping=0.3, rest_angle=0.2),
+    )
+
+
 MECHANISMS: dict[str, Callable[[], srm.Mechanism]] = {
     "a bushing closes a loop": lambda: bushed_four_bar(1e-2),
     "the governor A05": lambda: load("flyball_governor"),
@@ -92,7 +113,9 @@ MECHANISMS: dict[str, Callable[[], srm.Mechanism]] = {
     "a walker with damping": lambda: _damped(load("klann_walker"), "O"),
     "an open chain": lambda: _chain(forces=FORCES),
     "a chain on a plane": lambda: _chain(_SLOTTED, forces=FORCES),
-    "a chain with a cam": lambda: _damped(_chain(_CAM, forces=OTHER_FORCES), "j1"),
+    "a walker with damping in all joints": lambda: _damped_everywhere(load("klann_walker")),
+    "a four-bar with damping in all joints and springs": _damped_four_bar,
+    "a chain with a cam": lambda: _damped(_chain(_CAM, forces=OTHER_FORCES), "j0"),
 }
 
 
@@ -141,3 +164,37 @@ def test_the_linearised_equations_are_those_of_differences(
             (J, expected.J),
         ):
             assert np.abs(own - other).max() < 1e-6 * max(np.abs(other).max(), 1.0)
+
+
+RUNS: dict[str, tuple[Callable[[], srm.Mechanism], float]] = {
+    "bushing": (lambda: bushed_four_bar(1e-6), 0.3),
+    "governor": (lambda: load("flyball_governor"), 0.5),
+    "friction": (lambda: friction().mechanism, 2.0),
+    "damped joints": (_damped_four_bar, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_stiff_runs_by_generated_code_are_those_of_the_kernel(name: str) -> None:
+    make, t_end = RUNS[name]
+    mechanism = make()
+    kernel, generated = (
+        srm.simulate(mechanism, t_end, rtol=1e-7, tableau="rodas5p", backend=by)
+        for by in ("kernel", "generated")
+    )
+    assert generated.settings.backend == "generated"
+    assert abs(generated.stats.steps - kernel.stats.steps) <= 0.02 * kernel.stats.steps + 2
+    assert generated.stats.evaluations <= kernel.stats.evaluations
+    assert np.abs(generated.q[-1] - kernel.q[-1]).max() < 1e-6
+
+
+def test_no_derivatives_are_generated_where_nothing_damps_and_where_they_are_too_many(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert not load_code(load("squeezing_mechanism")).linearises
+    monkeypatch.setattr(linearisation, "MOST_STATEMENTS", 1000)
+    too_many = _damped(load("watt_six_bar"), "crank")
+    assert not load_code(too_many).linearises
+    run = srm.simulate(too_many, 0.1, tableau="rodas5p", backend="generated")
+    by_kernel = srm.simulate(too_many, 0.1, tableau="rodas5p", backend="kernel")
+    assert np.abs(run.q[-1] - by_kernel.q[-1]).max() < 1e-6

@@ -15,8 +15,8 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.integration.generated.code_cache import compile_and_load
 from srm_mbs.integration.generated.expressions import Expression, live_nodes
+from srm_mbs.integration.generated.source import source_of
 from srm_mbs.integration.generated.structure import structure_of
-from srm_mbs.integration.generated.terms import source_of
 
 _Numbers = ctypes.POINTER(ctypes.c_double)
 
@@ -46,7 +46,7 @@ class GeneratedFunction:
         self.library, _ = compile_and_load(
             source_of(self.structure).text, lambda path: ctypes.CDLL(str(path))
         )
-        sizes = (ctypes.c_int * 9).in_dll(self.library, "srm_mbs_sizes")
+        sizes = (ctypes.c_int * 11).in_dll(self.library, "srm_mbs_sizes")
         self.k = np.zeros(sizes[6])
         self.library.srm_mbs_constants(_pointer(parameters), _pointer(self.k))
 
@@ -56,9 +56,12 @@ class GeneratedFunction:
         M, G = np.zeros((nv, nv)), np.zeros((rows, nv))
         nle, tau, g, bias = np.zeros(nv), np.zeros(nv), np.zeros(rows), np.zeros(rows)
         entries = (_Numbers * max(rows, 1))(*(_pointer(row) for row in G))
+        values, own = np.zeros(self.structure.held), np.zeros(nv)
         arrays = [_pointer(np.ascontiguousarray(x)) for x in (q, v, self.k)]
-        out = [_pointer(x) for x in (M, nle, tau, g, bias)]
-        status = self.library.srm_mbs_terms(*arrays, None, *out, entries, None, None)
+        out = [_pointer(x) for x in (M, nle, tau, tau, values, own, g, bias)]
+        status = self.library.srm_mbs_terms(
+            *arrays, None, ctypes.c_double(0.0), None, *out, entries, None, None
+        )
         upper = M.T  # written column by column
         return Terms(upper + np.triu(upper, 1).T, nle, tau, g, bias, G, status)
 

@@ -306,6 +306,7 @@ void ForceLaws::resolve(const std::vector<ForceElement>& elements,
             acted[e.in_v] = true;
     for (std::size_t i = 0; i < acted.size(); ++i)
         if (acted[i]) of_coordinate_[i] = count++;
+    first_of_elements_ = count;
     for (std::size_t k = 0; k < elements.size(); ++k) {
         const ForceElement& e = elements[k];
         if ((e.kind == ForceKind::spring_damper && e.rest > 0.0) ||
@@ -356,6 +357,55 @@ void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 coupling_spring(e, q, v, tau, laws, laws ? laws->of_element(number, 0) : -1);
                 break;
         }
+    }
+}
+
+void add_bushings(const std::vector<ForceElement>& elements,
+                  const pinocchio_model::Workspace& work, std::vector<BushingStep>& step,
+                  double* tau, ForceLaws* laws) {
+    auto next = step.begin();
+    for (std::size_t number = 0; number < elements.size(); ++number) {
+        const ForceElement& e = elements[number];
+        if (e.kind == ForceKind::bushing)
+            bushing(e, work.data, turns(e) && next != step.end() ? &*next++ : nullptr,
+                    Sums{tau, nullptr}, laws, number);
+    }
+}
+
+namespace {
+
+// c = (1 - (x / 2) cot(x / 2)) / x^2 and its derivative by x^2, at x^2 = square.
+std::array<double, 2> log_coefficient(double square) {
+    if (square < 1e-2) {  // the series in the Bernoulli numbers: the next term is 1e-16 of the first
+        constexpr double terms[] = {1.0 / 12.0, 1.0 / 720.0, 1.0 / 30240.0, 1.0 / 1209600.0,
+                                    1.0 / 47900160.0, 691.0 / 1307674368000.0};
+        double value = 0.0, slope = 0.0;
+        for (int i = 5; i >= 0; --i) {
+            slope = slope * square + value;
+            value = value * square + terms[i];
+        }
+        return {value, slope};
+    }
+    const double half = 0.5 * std::sqrt(square), s = std::sin(half), along = half / std::tan(half);
+    const double value = (1.0 - along) / square;
+    // d along / d square = (along / square - 1 / (4 s^2)) / 2
+    return {value, -value / square - 0.5 * (along / square - 0.25 / (s * s)) / square};
+}
+
+}  // namespace
+
+void bushing_turns(const std::vector<ForceElement>& elements,
+                   const pinocchio_model::Workspace& work, std::vector<BushingStep>& step,
+                   double* out) {
+    auto next = step.begin();
+    for (const ForceElement& e : elements) {
+        if (e.kind != ForceKind::bushing) continue;
+        Vector3d turn = rotation_vector(e, work.data);
+        if (turns(e) && next != step.end()) (next++)->nearest(turn.data());
+        std::copy_n(turn.data(), 3, out);
+        const auto coefficient = log_coefficient(turn.squaredNorm());
+        std::copy_n(coefficient.data(), 2, out + 3);
+        out += 5;
     }
 }
 

@@ -103,6 +103,8 @@ public:
     // Number of the law of a coordinate, or -1; first one of an element, with the numbers (6) of
     // those of a bushing.
     int of_coordinate(int i) const { return of_coordinate_[i]; }
+    // Number of the first law of an element between links.
+    int first_of_elements() const { return first_of_elements_; }
     int of_element(std::size_t e, int component) const { return of_element_[6 * e + component]; }
 
     std::vector<double> values;       // at the evaluation made last
@@ -110,6 +112,7 @@ public:
 
 private:
     std::vector<int> of_coordinate_, of_element_;
+    int first_of_elements_ = 0;
 };
 
 // Adds the generalised forces at t, q, v to tau (nv,).  The workspace holds the placements, the
@@ -122,6 +125,15 @@ void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 const pinocchio_model::Workspace& work, double t, const double* q,
                 const double* v, std::vector<BushingStep>& step, double* tau, ForceLaws* laws,
                 double* on_bodies = nullptr);
+// The same of the bushings alone.
+void add_bushings(const std::vector<ForceElement>& elements,
+                  const pinocchio_model::Workspace& work, std::vector<BushingStep>& step,
+                  double* tau, ForceLaws* laws);
+// Of each bushing its rotation vector phi, c of Jlog(phi) = 1 + [phi] / 2 + c [phi]^2, and the
+// derivative of c by |phi|^2 (5 per bushing); the workspace holds the placements.
+void bushing_turns(const std::vector<ForceElement>& elements,
+                   const pinocchio_model::Workspace& work, std::vector<BushingStep>& step,
+                   double* out);
 
 // Potential energy (J) of those that have one; the workspace holds the placements.
 double potential_energy(const std::vector<ForceElement>& elements,

@@ -8,10 +8,22 @@ namespace srm {
 
 namespace {
 
-constexpr int interface_version = 1;  // ABI in integration/generated/terms.py
+constexpr int interface_version = 2;  // ABI in integration/generated/terms.py
 
 // Places in srm_mbs_sizes.
-enum Size { version, coordinates, rates, rows_of, rank_of, parameters_of, constants_of, laws_of, bodies_of };
+enum Size {
+    version,
+    coordinates,
+    rates,
+    rows_of,
+    rank_of,
+    parameters_of,
+    constants_of,
+    laws_of,
+    bodies_of,
+    held_of,
+    linear_constants_of
+};
 
 }  // namespace
 
@@ -30,6 +42,9 @@ GeneratedTerms::GeneratedTerms(const std::string& path, const std::vector<double
     terms_ = reinterpret_cast<Terms*>(find("srm_mbs_terms"));
     set_constants_ = reinterpret_cast<Constants*>(find("srm_mbs_constants"));
     factor_ = reinterpret_cast<Factor*>(dlsym(handle, "srm_mbs_factor"));
+    linearise_ = reinterpret_cast<Linearise*>(dlsym(handle, "srm_mbs_linearise"));
+    set_linear_constants_ =
+        linearise_ ? reinterpret_cast<Constants*>(find("srm_mbs_linear_constants")) : nullptr;
     set_parameters(parameters);
 }
 
@@ -43,7 +58,12 @@ void GeneratedTerms::set_parameters(const std::vector<double>& parameters) {
         throw std::invalid_argument("the generated code has another number of parameters");
     constants_.resize(static_cast<std::size_t>(sizes_[constants_of]));
     set_constants_(parameters.data(), constants_.data());
+    if (!linearise_) return;
+    linear_constants_.resize(static_cast<std::size_t>(sizes_[linear_constants_of]));
+    set_linear_constants_(parameters.data(), linear_constants_.data());
 }
+
+int GeneratedTerms::held() const { return sizes_[held_of]; }
 
 void GeneratedTerms::check(int nq, int nv, int rows, int rank, int laws, int bodies) const {
     if (sizes_[coordinates] != nq || sizes_[rates] != nv || sizes_[rows_of] != rows ||

@@ -79,16 +79,21 @@ void LinearStages::linearise(double t, double h, const double* state,
     rate_at(t, state, zone, rate_);
     laws_ = system_.law_values();
     applied_ = laws.empty() ? laws_ : laws;
-    system_.law_accelerations(W_.data());
     system_.apply_laws(m ? applied_.data() : nullptr);
     std::vector<double> steps(n);
     for (int j = 0; j < n; ++j)
         steps[j] = rounded_down(constants_.difference * std::max(unit_[j], state_scale[j]));
     std::fill(delta_.begin(), delta_.end(), 0.0);
-    if (system_.derivatives(state, &rate_[nv], A_.data(), C_.data(), D_.data()))
-        by_forces(t, state, steps);
-    else
-        by_differences(t, state, steps, zone);
+    if (system_.linearise(t, state, &rate_[nv], steps, C_.data(), D_.data(), W_.data(),
+                          L_.data())) {
+        chart_by_coordinates(steps);
+    } else {
+        system_.law_accelerations(W_.data());
+        if (system_.derivatives(state, &rate_[nv], A_.data(), C_.data(), D_.data()))
+            by_forces(t, state, steps);
+        else
+            by_differences(t, state, steps, zone);
+    }
     for (int j = 0; j < n; ++j) {
         double* const column = j < nv ? &C_[j * nv] : &D_[(j - nv) * nv];
         for (int k = 0; k < m; ++k)
@@ -164,6 +169,12 @@ void LinearStages::by_forces(double t, const double* state, const std::vector<do
                 L_[j * m + k] = (system_.law_values()[k] - laws_[k]) / steps[j];
         }
     }
+    chart_by_coordinates(steps);
+}
+
+// B, which is 0 but for joints that need a chart.
+void LinearStages::chart_by_coordinates(const std::vector<double>& steps) {
+    const int nv = nv_;
     for (const GroupJoint& joint : system_.groups())
         for (int j = joint.start; j < joint.start + joint.size; ++j) {
             delta_[j] = steps[j];
@@ -236,6 +247,16 @@ void LinearStages::multiply(const std::vector<double>& x, std::vector<double>& o
         add(x[j], &B_[j * nv], out.data(), nv);
         add(x[j], &C_[j * nv], &out[nv], nv);
         add(x[nv + j], &D_[j * nv], &out[nv], nv);
+    }
+}
+
+void LinearStages::jacobian(double* out) const {
+    std::vector<double> unit(n_), column(n_);
+    for (int j = 0; j < n_; ++j) {
+        unit[j] = 1.0;
+        multiply(unit, column);
+        unit[j] = 0.0;
+        std::copy(column.begin(), column.end(), out + static_cast<std::ptrdiff_t>(j) * n_);
     }
 }
 

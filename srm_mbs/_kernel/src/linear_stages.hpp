@@ -33,6 +33,17 @@ public:
     const std::vector<double>& applied() const { return applied_; }  // (m,), at the start
     const std::vector<double>& laws() const { return laws_; }        // (m,), what they are there
     int count() const { return count_; }                             // m
+    // Linearises the system at any regular state, with laws that act as they are.
+    void linearise_anew(double t, double h, const double* state,
+                        const std::vector<double>& state_scale) {
+        known_ = false;
+        linearise(t, h, state, state_scale, {}, {});
+    }
+    // J (n, n), column by column, at the start; the laws by the chart coordinates (m, n), and the
+    // accelerations by the laws (nv, m), alike.
+    void jacobian(double* out) const;
+    const std::vector<double>& laws_by_coordinates() const { return L_; }
+    const std::vector<double>& by_laws() const { return W_; }
     // Estimate of h |lambda|, lambda the largest eigenvalue of J.
     double stiffness(double h);
 
@@ -44,6 +55,7 @@ private:
                  std::vector<double>& out);
     void by_differences(double t, const double* state, const std::vector<double>& steps,
                         const System::ZoneView& zone);
+    void chart_by_coordinates(const std::vector<double>& steps);
     void by_forces(double t, const double* state, const std::vector<double>& steps);
     void factorise(double k);
     void multiply(const std::vector<double>& x, std::vector<double>& out) const;  // J x

@@ -384,6 +384,31 @@ struct PySystem {
         code = std::move(generated);
     }
 
+    // The system linearised at a regular state, so many times: J (n, n), the laws by the chart
+    // coordinates (m, n) and the accelerations by the laws (nv, m), each column by column.
+    nb::object linearisation(const Constants& constants, double t, double h, const Array& state,
+                             const std::vector<double>& unit,
+                             const std::vector<double>& state_scale, int repeats) {
+        const auto x = vector_of(state, state_size(), "state");
+        const std::size_t n = 2 * static_cast<std::size_t>(system->nv);
+        expect_size("unit", unit.size(), n);
+        expect_size("state_scale", state_scale.size(), n);
+        LinearStages stages(*system, 1.0, unit, constants);
+        system->track_laws(true);
+        try {
+            for (int i = 0; i < repeats; ++i) stages.linearise_anew(t, h, x, state_scale);
+        } catch (...) {
+            system->track_laws(false);
+            throw;
+        }
+        system->track_laws(false);
+        std::vector<double> J(n * n);
+        stages.jacobian(J.data());
+        return nb::make_tuple(owned_array(std::move(J)),
+                              owned_array(std::vector<double>(stages.laws_by_coordinates())),
+                              owned_array(std::vector<double>(stages.by_laws())));
+    }
+
     void hold(double t, const Array& force, bool keep) {
         system->hold(t, vector_of(force, system->nv, "force"), keep);
     }
@@ -404,7 +429,8 @@ void bind_system(nb::module_& m) {
         .def("with_parameters",
              [](const GeneratedTerms& self, const Array& parameters) {
                  return GeneratedTerms(self, to_vector(parameters));
-             });
+             })
+        .def_prop_ro("linearises", &GeneratedTerms::linearises);
     nb::class_<PySystem>(
         m, "System",
         nb::type_slots(collected<PySystem, &PySystem::model, &PySystem::controller,
@@ -435,6 +461,9 @@ void bind_system(nb::module_& m) {
         .def("energies", &PySystem::energies)
         .def("powers", &PySystem::powers, nb::arg("t"), nb::arg("states"), nb::arg("elements"),
              nb::arg("resting"))
+        .def("linearisation", &PySystem::linearisation, nb::arg("constants"), nb::arg("t"),
+             nb::arg("h"), nb::arg("state"), nb::arg("unit"), nb::arg("state_scale"),
+             nb::arg("repeats") = 1)
         .def("hold", &PySystem::hold)
         .def("use_code", &PySystem::use_code, nb::arg("code").none())
         .def("renew", &PySystem::renew, nb::arg("unit"), nb::arg("gap_scale"),

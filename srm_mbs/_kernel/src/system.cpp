@@ -431,14 +431,19 @@ int System::resolve_laws() {
     return nv;
 }
 
-// The forces of joined laws, or what acts in their place, and those of the other elements.
-void System::joined_forces(double t, const double* q) {
-    auto& w = *work_;
+// Damping and friction as joined laws.
+void System::passive_joined() {
     for (int i = 0; i < nv; ++i) {
         joined_[i] = data_.damping.empty() ? 0.0 : -data_.damping[i] * v_[i];
         if (!data_.friction.empty())
             joined_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
     }
+}
+
+// The forces of joined laws, or what acts in their place, and those of the other elements.
+void System::joined_forces(double t, const double* q) {
+    auto& w = *work_;
+    passive_joined();
     add_forces(lawful_, data_.coincident, w, t, q, v_.data(), bushings_, joined_.data(), nullptr);
     add_forces(lawless_, data_.coincident, w, t, q, v_.data(), bushings_, f_.data(), nullptr);
     const double* acting = laws_.applied ? laws_.applied : joined_.data();
@@ -474,6 +479,10 @@ void System::law_accelerations(double* out) {
         add_forces(data_.forces, data_.coincident, w, 0.0, w.q.data(), v_.data(), bushings_,
                    tau.data(), &laws_);
     };
+    if (code_) {  // it computes the kinematics of bushings only
+        pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
+        pinocchio::computeJointJacobians(w.model, w.data);
+    }
     if (!closed_ && nv > one_pass_size) {
         pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
         factorise_mass();
@@ -574,18 +583,30 @@ void System::use_code(const GeneratedTerms* code) {
     if (code) {
         std::size_t laws = 0;
         std::vector<int> joints;
-        bushing_elements_.clear();
+        std::size_t bushings = 0;
         for (const ForceElement& force : data_.forces) {
             laws += force.curves.size();
             if (force.kind != ForceKind::bushing) continue;
-            bushing_elements_.push_back(force);
+            ++bushings;
             for (const int joint : {force.a.joint, force.b.joint})
                 if (joint && std::find(joints.begin(), joints.end(), joint) == joints.end())
                     joints.push_back(joint);
         }
         code->check(nq, nv, data_.rows, data_.structural_rank, static_cast<int>(laws),
                     static_cast<int>(joints.size()));
+        const std::size_t held = code->held(), n = nv;
         law_values_.resize(laws);
+        held_values_.resize(held);
+        own_laws_.resize(nv);
+        if (code->linearises()) {
+            turns_.resize(5 * bushings);
+            multipliers_.resize(data_.rows);
+            Dr_.resize(n * (2 * n + held));
+            Dc_.resize(data_.rows * 2 * n);
+            Dl_.resize(held * 2 * n);
+            Dq_.resize(n);
+            Dv_.resize(n);
+        }
         columns_of_rows_.resize(data_.rows);
         bushing_bodies_.clear();
         for (const int joint : joints) {
@@ -610,7 +631,7 @@ void System::use_code(const GeneratedTerms* code) {
 }
 
 // M, the forces f and the rows of the closures, by generated code.
-void System::generated_terms(double t, const double* state) {
+void System::generated_terms(double t, const double* state, ForceLaws* laws) {
     auto& w = *work_;
     std::size_t law = 0;
     double s[3];
@@ -620,13 +641,31 @@ void System::generated_terms(double t, const double* state) {
             law_values_[law++] = s[0];
         }
     for (int row = 0; row < data_.rows; ++row) columns_of_rows_[row] = column(row);
-    if (!code_->evaluate(state, state + nq, law_values_.data(), w.data.M.data(), w.data.nle.data(),
-                         f_.data(), g_.data(), bias_.data(), columns_of_rows_.data(),
-                         bushing_bodies_.data(), w.data.J.data()))
+    const bool joined = laws && !joined_.empty();
+    if (joined) {
+        passive_joined();
+        laws = nullptr;
+    }
+    double* const lawful = joined ? joined_.data() : f_.data();
+    const int first = laws ? laws->first_of_elements() : 0;
+    if (laws) std::fill(own_laws_.begin(), own_laws_.end(), 0.0);
+    if (!code_->evaluate(state, state + nq, law_values_.data(),
+                         laws && laws->applied ? laws->applied + first : nullptr,
+                         w.data.M.data(), w.data.nle.data(), f_.data(), lawful,
+                         held_values_.data(), own_laws_.data(), g_.data(), bias_.data(),
+                         columns_of_rows_.data(), bushing_bodies_.data(), w.data.J.data()))
         throw EvaluationError{Failure::coincident};
-    if (!bushing_elements_.empty())
-        add_forces(bushing_elements_, data_.coincident, w, t, state, v_.data(), bushings_,
-                   f_.data(), nullptr);
+    if (laws) {
+        std::copy(held_values_.begin(), held_values_.end(), laws->values.begin() + first);
+        for (int i = 0; i < nv; ++i)
+            if (const int own = laws->of_coordinate(i); own >= 0) laws->values[own] += own_laws_[i];
+    }
+    add_bushings(data_.forces, w, bushings_, lawful, laws);
+    if (joined) {
+        joined_act_ = !laws_.applied;
+        const double* acting = joined_act_ ? joined_.data() : laws_.applied;
+        for (int i = 0; i < nv; ++i) f_[i] += acting[i];
+    }
     for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];
 }
 
@@ -635,7 +674,7 @@ void System::tree_terms(const double* state) {
     std::copy(state, state + nq, w.q.data());
     std::copy(state + nq, state + nq + nv, w.v.data());
     if (code_)
-        generated_terms(0.0, state);
+        generated_terms(0.0, state, nullptr);
     else if (closed_)
         pinocchio_model::compute_terms(w);
     else
@@ -708,6 +747,146 @@ bool System::derivatives(const double* state, const double* a, double* by_forces
     return true;
 }
 
+// From a change r = dr of the residual forces and c = dc of the rows' accelerations to da: M da + G^T dlam = -dr, G da = -dc.
+void System::acceleration_of(double* r, const double* c) {
+    for (int i = 0; i < nv; ++i) r[i] = -r[i];
+    if (!closed_) {
+        lu_solve(factors_.data(), nv, pivots_.data(), r);
+        return;
+    }
+    projection_->whiten_force(r);
+    projection_->remove_normal(r);
+    if (c) {
+        projection_->normal(c, white_.data());
+        for (int i = 0; i < nv; ++i) r[i] -= white_[i];
+    }
+    projection_->unwhiten(r);
+}
+
+// The derivative of damping and friction of a coordinate by its rate.
+double System::passive_slope(int i) const {
+    double out = data_.damping.empty() ? 0.0 : -data_.damping[i];
+    if (data_.friction.empty()) return out;
+    const double share = std::tanh(v_[i] / data_.friction_speed);
+    return out - data_.friction[i] / data_.friction_speed * (1.0 - share * share);
+}
+
+// Adds to Dr_ what the controller contributes.
+void System::controller_by_state(double t, const double* state, const std::vector<double>& steps) {
+    t = std::min(std::max(t, first_), last_);
+    std::vector<double> x(nq + nv), delta(2 * nv), here(nv);
+    controller_(t, state, state + nq, here.data());
+    for (int j = 0; j < 2 * nv; ++j) {
+        delta[j] = steps[j];
+        retract(state, delta.data(), x.data());
+        delta[j] = 0.0;
+        controller_(t, x.data(), x.data() + nq, acted_.data());
+        for (int i = 0; i < nv; ++i) Dr_[j * nv + i] -= (acted_[i] - here[i]) / steps[j];
+    }
+}
+
+// The generated derivatives with these accelerations (nv,), multipliers (rows,) and laws of elements.
+void System::generated_derivatives(const double* state, const double* a, const double* lam,
+                                   const double* applied) {
+    for (auto* zeroed : {&Dr_, &Dc_, &Dl_, &Dq_, &Dv_})
+        std::fill(zeroed->begin(), zeroed->end(), 0.0);
+    code_->linearise(state, state + nq, law_values_.data(), a, lam, applied, turns_.data(),
+                     Dr_.data(), Dc_.data(), Dl_.data(), Dq_.data(), Dv_.data());
+}
+
+bool System::linearise(double t, const double* state, const double* a,
+                       const std::vector<double>& steps, double* by_q, double* by_v,
+                       double* by_laws, double* of_laws) {
+    if (!code_ || !code_->linearises() || rank_deficient()) return false;
+    const bool joined = !joined_.empty();
+    if (joined && !turns_.empty()) return false;
+    auto& w = *work_;
+    if (closed_) {
+        white_ = projection_->white_multiplier;
+        projection_->multiplier(white_.data(), multipliers_.data());
+    } else if (nv > one_pass_size) {
+        pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
+        factorise_mass();
+    }
+    bushing_turns(data_.forces, w, bushings_, turns_.data());
+    if (joined) joined_laws_by_state(state, a, of_laws);
+    const int first = joined ? 0 : laws_.first_of_elements();
+    const std::vector<double> none(code_->held());
+    const double* const applied =
+        joined || !laws_.applied ? none.data() : laws_.applied + first;
+    generated_derivatives(state, a, multipliers_.data(), applied);
+    if (controller_) controller_by_state(t, state, steps);
+    for (int j = 0; j < 2 * nv; ++j) {
+        double* const column = j < nv ? by_q + j * nv : by_v + (j - nv) * nv;
+        std::copy_n(&Dr_[j * nv], nv, column);
+        acceleration_of(column, closed_ ? &Dc_[j * data_.rows] : nullptr);
+    }
+    const int m = laws_.count();
+    for (int k = 0; k < m; ++k) {
+        double* const column = by_laws + k * nv;
+        if (joined || k < first) {
+            std::fill_n(column, nv, 0.0);
+        } else {
+            std::copy_n(&Dr_[(2 * nv + k - first) * nv], nv, column);
+            acceleration_of(column, nullptr);
+        }
+    }
+    for (int i = 0; i < nv; ++i)
+        if (const int law = joined ? i : laws_.of_coordinate(i); law >= 0) {
+            by_laws[law * nv + i] = -1.0;
+            acceleration_of(by_laws + law * nv, nullptr);
+        }
+    if (joined) return true;
+    for (int j = 0; j < 2 * nv; ++j) {
+        std::fill_n(of_laws + j * m, first, 0.0);
+        std::copy_n(Dl_.begin() + j * (m - first), m - first, of_laws + j * m + first);
+    }
+    for (int i = 0; i < nv; ++i)
+        if (const int law = laws_.of_coordinate(i); law >= 0) {
+            of_laws[i * m + law] = Dq_[i];
+            of_laws[(nv + i) * m + law] = Dv_[i] + passive_slope(i);
+        }
+    return true;
+}
+
+// Derivatives (nv, 2 nv) of joined laws z = M u with M u + G^T mu = F and G u = 0, F the forces of
+// the laws (nv,): those of M u + G^T mu and of G u are what derivatives with a + u and lam + mu
+// have in addition to those with a and lam, because they are linear in these.
+void System::joined_laws_by_state(const double* state, const double* a, double* out) {
+    const int rows = data_.rows, held = code_->held();
+    const std::size_t n = nv, columns = 2 * n;
+    std::vector<double> u(joined_), mu(rows), accelerations(a, a + nv);
+    projection_->whiten_force(u.data());
+    projection_->multiplier(u.data(), mu.data());
+    projection_->remove_normal(u.data());
+    projection_->unwhiten(u.data());
+    const std::vector<double> none(held);
+    // What acts from now on is z, of which the closures take up nothing.
+    if (joined_act_)
+        for (int i = 0; i < rows; ++i) multipliers_[i] -= mu[i];
+    std::vector<double> multipliers(multipliers_);
+    generated_derivatives(state, accelerations.data(), multipliers.data(), none.data());
+    const std::vector<double> r(Dr_), c(Dc_);
+    for (int i = 0; i < nv; ++i) accelerations[i] += u[i];
+    generated_derivatives(state, accelerations.data(), multipliers.data(), none.data());
+    for (std::size_t i = 0; i < columns * n; ++i) out[i] = Dr_[i] - r[i];  // dM u
+    for (int i = 0; i < rows; ++i) multipliers[i] += mu[i];
+    generated_derivatives(state, accelerations.data(), multipliers.data(), held_values_.data());
+    std::vector<double> change(n), moved(n), rows_change(rows);
+    for (std::size_t j = 0; j < columns; ++j) {
+        for (std::size_t i = 0; i < n; ++i) change[i] = Dr_[j * n + i] - r[j * n + i];
+        for (int e = 0; e < held; ++e)
+            add(Dl_[j * held + e], &Dr_[(columns + e) * n], change.data(), nv);
+        const std::size_t i = j % n;
+        change[i] -= j < n ? Dq_[i] : Dv_[i] + passive_slope(static_cast<int>(i));
+        for (int row = 0; row < rows; ++row)
+            rows_change[row] = Dc_[j * rows + row] - c[j * rows + row];
+        acceleration_of(change.data(), rows_change.data());
+        mass_times(change.data(), moved.data());
+        for (std::size_t k = 0; k < n; ++k) out[j * n + k] += moved[k];
+    }
+}
+
 void System::evaluate(double t, const double* state, const ZoneView& zone) {
     ++evaluations;
     t = std::min(std::max(t, first_), last_);
@@ -718,6 +897,14 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     coordinate_forces(t, state);
     ForceLaws* const laws = tracks_laws_ ? &laws_ : nullptr;
     const bool joined = laws && !joined_.empty();
+    if (!closed_ && code_ && (!laws || nv <= one_pass_size)) {
+        generated_terms(t, state, laws);
+        factorise_mass();
+        std::copy(f_.begin(), f_.end(), rate_.begin());
+        lu_solve(factors_.data(), nv, pivots_.data(), rate_.data());
+        if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
+        return;
+    }
     if (!closed_ && laws && nv <= one_pass_size) {
         // The one pass over the tree that closures have costs less than three.
         pinocchio_model::compute_terms(w);
@@ -725,14 +912,6 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
         add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, rate_.data(),
                        laws);
         factorise_mass();
-        lu_solve(factors_.data(), nv, pivots_.data(), rate_.data());
-        if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
-        return;
-    }
-    if (!closed_ && code_) {
-        generated_terms(t, state);
-        factorise_mass();
-        std::copy(f_.begin(), f_.end(), rate_.begin());
         lu_solve(factors_.data(), nv, pivots_.data(), rate_.data());
         if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
         return;
@@ -750,8 +929,8 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
         if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
         return;
     }
-    if (code_ && !laws) {
-        generated_terms(t, state);
+    if (code_) {
+        generated_terms(t, state, laws);
     } else {
         pinocchio_model::compute_terms(w);
         for (int i = 0; i < nv; ++i) f_[i] -= w.data.nle[i];

@@ -152,7 +152,7 @@ public:
     // The pass over the tree that an evaluation begins with, alone: to measure it.
     void tree_terms(const double* state);
     // From now on evaluations take their terms from generated code, which outlives its use; null:
-    // from the pass over the tree.  Stages of stiff steps take them from there in any case.
+    // from the pass over the tree.
     void use_code(const GeneratedTerms* code);
     // Evaluates at times within [first, last] only: on one side of a breakpoint.
     void between(double first, double last) {
@@ -265,6 +265,14 @@ public:
     // only differences give them.  Other terms of the stage are lost.
     bool derivatives(const double* state, const double* a, double* by_forces, double* by_q,
                      double* by_v);
+    // The same by generated code, at the stage evaluated last, with the accelerations a (nv,) and
+    // with laws applied if there are any: their derivatives by the chart coordinates while the laws
+    // are held and by the laws (nv, count), and those of the laws (count, 2 nv).  Functions of the
+    // user are differentiated with these steps (2 nv,).  False where no code was generated, and
+    // where rows depend on each other.
+    bool linearise(double t, const double* state, const double* a,
+                   const std::vector<double>& steps, double* by_q, double* by_v, double* by_laws,
+                   double* of_laws);
     // All forces (nv,) but those of inertia, gravity and closures, and the values of the laws.
     void applied_forces(double t, const double* state, double* out);
     // Whether the laws, each of its own coordinate, are all that makes them depend on the state.
@@ -307,18 +315,29 @@ private:
     void joined_forces(double t, const double* q);
     void joined_values();
     void factorise_mass();
-    void generated_terms(double t, const double* state);
+    void generated_terms(double t, const double* state, ForceLaws* laws);
+    void passive_joined();
+    void acceleration_of(double* r, const double* c);
+    double passive_slope(int i) const;
+    void generated_derivatives(const double* state, const double* a, const double* lam,
+                               const double* applied);
+    void joined_laws_by_state(const double* state, const double* a, double* out);
+    void controller_by_state(double t, const double* state, const std::vector<double>& steps);
     const GeneratedTerms* code_ = nullptr;
     std::unique_ptr<Projection> generated_projection_;  // or the other one, while it is in use
     bool uses_generated_projection_ = false;
     std::vector<double> law_values_;  // of the forces' curves, for generated code
     std::vector<double*> columns_of_rows_;
-    std::vector<ForceElement> bushing_elements_;  // and the memory of their kinematics
-    std::vector<double*> bushing_bodies_;
+    std::vector<double*> bushing_bodies_;  // the memory of their kinematics
+    std::vector<double> held_values_, own_laws_;
+    // Of generated derivatives, column by column: residuals by (q, v, laws), rows and laws by (q, v),
+    // laws of coordinates by their own.
+    std::vector<double> turns_, multipliers_, Dr_, Dc_, Dl_, Dq_, Dv_;
     ForceLaws laws_;
     // Elements with laws, and the others, where the laws are joined.
     std::vector<ForceElement> lawful_, lawless_;
     std::vector<double> joined_;  // (nv,), generalised forces of joined laws; empty: they are not
+    bool joined_act_ = false;     // these themselves, at the stage that code evaluated last
     std::vector<double> factors_;  // (nv, nv), of M of an open tree
     std::vector<int> pivots_;
     bool tracks_laws_ = false;

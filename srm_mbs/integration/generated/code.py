@@ -29,12 +29,12 @@ from srm_mbs.integration.generated.code_cache import (
     compile_and_load,
     load_cached,
 )
+from srm_mbs.integration.generated.source import Source, source_of
 from srm_mbs.integration.generated.structure import (
     Structure,
     UnsupportedElementError,
     structure_of,
 )
-from srm_mbs.integration.generated.terms import Source, source_of
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 MOST_OPERATIONS = 40_000

@@ -106,6 +106,9 @@ class Force(NamedTuple):
         Stiffness, damping and rest (3).
     laws
         Number of the first curve of its numbers among those of the mechanism, and their count.
+    held
+        Number of its law among those that stiff steps hold; -1: it has none, or that of its
+        coordinate.
     """
 
     kind: int
@@ -122,6 +125,30 @@ class Force(NamedTuple):
     in_link_axes: bool
     numbers: Span
     laws: Span
+    held: int
+
+
+class Bushing(NamedTuple):
+    """A bushing, which the kernel evaluates and of which stiff steps take derivatives.
+
+    Attributes
+    ----------
+    factors
+        ``signs`` of the columns.
+    coefficients
+        Stiffness (6) and damping (6).
+    held
+        Numbers of the laws (6) of its forces and moments, as of :class:`Force`.
+    """
+
+    joint_a: int
+    joint_b: int
+    at_a: Span
+    at_b: Span
+    columns: tuple[int, ...]
+    factors: Span
+    coefficients: Span
+    held: tuple[int, ...]
 
 
 class Structure(NamedTuple):
@@ -136,6 +163,11 @@ class Structure(NamedTuple):
     bushing_joints, bushing_columns
         Joints of the bodies between which bushings act, without the ground, and rates that move
         them.
+    held
+        Number of the laws of elements between links that stiff steps hold: ``ForceLaws`` of
+        forces.hpp, without those of coordinates.
+    passive
+        Whether damping or friction acts on a coordinate.
     """
 
     nq: int
@@ -151,6 +183,9 @@ class Structure(NamedTuple):
     coordinate_rows: tuple[CoordinateRow, ...]
     subtractions: tuple[Subtraction, ...]
     forces: tuple[Force, ...]
+    bushings: tuple[Bushing, ...]
+    held: int
+    passive: bool
     bushing_joints: tuple[int, ...]
     bushing_columns: tuple[int, ...]
     codes: bytes
@@ -276,9 +311,9 @@ def _signs(support: FloatArray) -> tuple[tuple[int, int], ...]:
     return tuple((int(j), int(support[j])) for j in np.flatnonzero(support))
 
 
-BUSHING = 4
-"""The kind of bushings among those of forces.hpp: the kernel evaluates them, because their moments
-depend on the step."""
+SPRING_DAMPER, BUSHING, COUPLING = 0, 4, 6
+"""Kinds among those of forces.hpp.  The kernel evaluates bushings, because their moments depend on
+the step."""
 _NO_ANCHOR = (0, np.array(_NO_PLACEMENT))
 
 
@@ -317,8 +352,9 @@ def structure_of(model: pin.Model, constants: Mapping[str, Any]) -> tuple[Struct
             Subtraction(row, other, numbers.take([factor]), tuple(columns))
             for row, other, factor, columns in constants["eliminations"]
         ),
-        "forces": _forces(numbers, constants["forces"]),
+        "passive": any(constants[key] is not None for key in ("damping", "friction")),
     }
+    fields |= _forces(numbers, constants["forces"])
     bushings = [force for force in constants["forces"] if force["kind"] == BUSHING]
     joints = [int(force[end][0]) for force in bushings for end in ("a", "b")]
     columns = {int(j) for force in bushings for j in np.flatnonzero(force["support"])}
@@ -395,33 +431,44 @@ def _row(
     )
 
 
-def _forces(numbers: _Numbers, forces: Sequence[Mapping[str, Any]]) -> tuple[Force, ...]:
-    out = []
-    laws = 0
+def _forces(numbers: _Numbers, forces: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The fields of a structure for the force elements."""
+    out, bushings = [], []
+    laws = held = 0
     for force in forces:
-        if force["kind"] == BUSHING:
-            continue
         a, b = force.get("a", _NO_ANCHOR), force.get("b", _NO_ANCHOR)
         support = np.asarray(force.get("support", ()), dtype=float)
         columns = np.flatnonzero(support)
+        ends = int(a[0]), int(b[0]), numbers.rotated(a[1].tolist()), numbers.rotated(b[1].tolist())
+        moves = tuple(columns.tolist()), numbers.take(support[columns].tolist(), units=True)
+        own = np.asarray(force.get("numbers", ()))
+        if force["kind"] == BUSHING:
+            acts = (own[:6] > 0.0) | (own[6:] > 0.0)
+            law_of = np.where(acts, held + np.cumsum(acts) - 1, -1)
+            bushings.append(
+                Bushing(*ends, *moves, numbers.take(own.tolist()), tuple(law_of.tolist()))
+            )
+            held += int(acts.sum())
+            continue
+        has_law = force["kind"] == COUPLING or (
+            force["kind"] == SPRING_DAMPER and force["rest"] > 0.0
+        )
         curves = len(force.get("curves", ()))
         out.append(
             Force(
                 force["kind"],
-                int(a[0]),
-                int(b[0]),
-                numbers.rotated(a[1].tolist()),
-                numbers.rotated(b[1].tolist()),
-                tuple(columns.tolist()),
-                numbers.take(support[columns].tolist(), units=True),
+                *ends,
+                *moves,
                 tuple(force.get("positions", ())),
                 numbers.take([force.get(key, 0.0) for key in ("stiffness", "damping", "rest")]),
                 force.get("in_q", 0),
                 force.get("in_v", 0),
                 bool(force.get("turns", False)),
-                numbers.take(np.asarray(force.get("numbers", ())).tolist()),
+                numbers.take(own.tolist()),
                 Span(laws, curves),
+                held if has_law else -1,
             )
         )
         laws += curves
-    return tuple(out)
+        held += has_law
+    return {"forces": tuple(out), "bushings": tuple(bushings), "held": held}

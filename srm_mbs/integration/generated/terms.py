@@ -20,9 +20,9 @@ algebra.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
-from srm_mbs.integration.generated.algebra import algebra_of
 from srm_mbs.integration.generated.differentiation import Direction
 from srm_mbs.integration.generated.expressions import (
     PARAMETER,
@@ -30,7 +30,6 @@ from srm_mbs.integration.generated.expressions import (
     Guard,
     Output,
     Recorder,
-    write_c,
 )
 from srm_mbs.integration.generated.structure import (
     MINUS_ONE,
@@ -44,94 +43,25 @@ from srm_mbs.integration.generated.structure import (
     Structure,
     UnsupportedElementError,
 )
+from srm_mbs.integration.generated.vectors import (
+    Matrix,
+    Moments,
+    Vector,
+    add,
+    cross,
+    dot,
+    product,
+    scaled,
+    subtract,
+    times,
+    transposed,
+)
 
-Vector = tuple[Expression, Expression, Expression]
-Matrix = tuple[Vector, Vector, Vector]
-"""Row by row."""
-
-ABI = 1
-"""Version of the functions that the kernel calls: ``interface_version`` in generated.cpp."""
-
-
-def _add(a: Vector, b: Vector) -> Vector:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-def _subtract(a: Vector, b: Vector) -> Vector:
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
-
-
-def _scaled(s: Expression, a: Vector) -> Vector:
-    return s * a[0], s * a[1], s * a[2]
+Row = dict[int, Expression]
+"""Entries by their numbers."""
 
 
-def _dot(a: Vector, b: Vector) -> Expression:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
-
-
-def _times(R: Matrix, a: Vector) -> Vector:
-    return _dot(R[0], a), _dot(R[1], a), _dot(R[2], a)
-
-
-def _transposed(R: Matrix) -> Matrix:
-    return (
-        (R[0][0], R[1][0], R[2][0]),
-        (R[0][1], R[1][1], R[2][1]),
-        (R[0][2], R[1][2], R[2][2]),
-    )
-
-
-def _product(R: Matrix, S: Matrix) -> Matrix:
-    columns = _transposed(S)
-    return (
-        (_dot(R[0], columns[0]), _dot(R[0], columns[1]), _dot(R[0], columns[2])),
-        (_dot(R[1], columns[0]), _dot(R[1], columns[1]), _dot(R[1], columns[2])),
-        (_dot(R[2], columns[0]), _dot(R[2], columns[1]), _dot(R[2], columns[2])),
-    )
-
-
-class _Moments(NamedTuple):
-    """A symmetric tensor."""
-
-    xx: Expression
-    xy: Expression
-    xz: Expression
-    yy: Expression
-    yz: Expression
-    zz: Expression
-
-    def times(self, a: Vector) -> Vector:
-        return (
-            self.xx * a[0] + self.xy * a[1] + self.xz * a[2],
-            self.xy * a[0] + self.yy * a[1] + self.yz * a[2],
-            self.xz * a[0] + self.yz * a[1] + self.zz * a[2],
-        )
-
-    @property
-    def matrix(self) -> Matrix:
-        return (
-            (self.xx, self.xy, self.xz),
-            (self.xy, self.yy, self.yz),
-            (self.xz, self.yz, self.zz),
-        )
-
-    def plus(self, other: _Moments) -> _Moments:
-        return _Moments(*(a + b for a, b in zip(self, other)))
-
-    @property
-    def is_zero(self) -> bool:
-        return all(entry.is_zero for entry in self)
-
-
-class _Column(NamedTuple):
+class Column(NamedTuple):
     """A column of the world Jacobian: the motion of a body by one rate."""
 
     in_v: int
@@ -139,7 +69,7 @@ class _Column(NamedTuple):
     angular: Vector
 
 
-class _Body(NamedTuple):
+class Body(NamedTuple):
     """A body in world axes; velocity and acceleration are of its point at the world's origin."""
 
     rotation: Matrix
@@ -151,37 +81,37 @@ class _Body(NamedTuple):
 
     def point(self, local: Vector) -> Vector:
         """The place of a point of the body."""
-        return _add(self.origin, _times(self.rotation, local))
+        return add(self.origin, times(self.rotation, local))
 
     def point_velocity(self, x: Vector) -> Vector:
         """Velocity of its point at ``x``."""
-        return _add(self.velocity, _cross(self.spin, x))
+        return add(self.velocity, cross(self.spin, x))
 
     def point_bias(self, x: Vector) -> Vector:
         """Acceleration of its point at ``x``, without those of the joints."""
-        carried = _cross(self.spin, self.point_velocity(x))
-        return _add(_add(self.bias, _cross(self.spin_bias, x)), carried)
+        carried = cross(self.spin, self.point_velocity(x))
+        return add(add(self.bias, cross(self.spin_bias, x)), carried)
 
 
-class _Inertia(NamedTuple):
+class Inertia(NamedTuple):
     """Mass, mass centre and moments about it, in world axes."""
 
     mass: Expression
     centre: Vector
-    moments: _Moments
+    moments: Moments
 
-    def plus(self, other: _Inertia) -> _Inertia:
+    def plus(self, other: Inertia) -> Inertia:
         """Both bodies together."""
         if other.mass.is_zero:
-            return _Inertia(self.mass, self.centre, self.moments.plus(other.moments))
+            return Inertia(self.mass, self.centre, self.moments.plus(other.moments))
         if self.mass.is_zero:
-            return _Inertia(other.mass, other.centre, self.moments.plus(other.moments))
+            return Inertia(other.mass, other.centre, self.moments.plus(other.moments))
         mass = self.mass + other.mass
         share = other.mass / mass
-        apart = _subtract(other.centre, self.centre)
+        apart = subtract(other.centre, self.centre)
         reduced = self.mass * share
         x, y, z = apart
-        shifted = _Moments(
+        shifted = Moments(
             reduced * (y * y + z * z),
             -(reduced * (x * y)),
             -(reduced * (x * z)),
@@ -189,11 +119,11 @@ class _Inertia(NamedTuple):
             -(reduced * (y * z)),
             reduced * (x * x + y * y),
         )
-        centre = _add(self.centre, _scaled(share, apart))
-        return _Inertia(mass, centre, self.moments.plus(other.moments).plus(shifted))
+        centre = add(self.centre, scaled(share, apart))
+        return Inertia(mass, centre, self.moments.plus(other.moments).plus(shifted))
 
 
-class _Trace:
+class Trace:
     """Records the terms of a structure."""
 
     def __init__(self, structure: Structure) -> None:
@@ -210,7 +140,7 @@ class _Trace:
         self.nothing: Vector = (zero, zero, zero)
         self.units: Matrix = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
         gravity = self.take(structure.gravity)
-        self.ground = _Body(
+        self.ground = Body(
             self.units,
             self.nothing,
             self.nothing,
@@ -218,10 +148,13 @@ class _Trace:
             (-gravity[0], -gravity[1], -gravity[2]),
             (-gravity[3], -gravity[4], -gravity[5]),
         )
+        self.accelerations = [zero] * structure.nv
+        """Those of the rates; without them, terms are nonlinear effects and bias."""
+        self.held = recorder.leaf("held")
         self.guards: list[Guard] = []
         self.outputs: list[Output] = []
-        self.bodies: list[_Body] = []
-        self.columns: list[list[_Column]] = []
+        self.bodies: list[Body] = []
+        self.columns: list[list[Column]] = []
         """Of each motion, its own."""
 
     def take(self, span: Span) -> list[Expression]:
@@ -236,7 +169,7 @@ class _Trace:
         rotation = (n[0], n[1], n[2]), (n[3], n[4], n[5]), (n[6], n[7], n[8])
         return rotation, (n[9], n[10], n[11])
 
-    def body(self, joint: int) -> _Body:
+    def body(self, joint: int) -> Body:
         """The body of a joint of the model."""
         number = self.structure.bodies[joint]
         return self.ground if number < 0 else self.bodies[number]
@@ -265,7 +198,7 @@ class _Trace:
         if kind == "spherical":
             return self._turns_quaternion(first)
         if kind == "free":
-            axes = _transposed(self._of_quaternion(first + 3))
+            axes = transposed(self._of_quaternion(first + 3))
             shifts: list[Direction] = [dict(zip(q[first : first + 3], axis)) for axis in axes]
             return [*shifts, *self._turns_quaternion(first + 3)]
         count = 3 if kind == "translation" else 1
@@ -326,11 +259,11 @@ class _Trace:
             rotation = self._about(axis, c, s)
             if kind != "helical":
                 return rotation, none, [(none, axis)]
-            along = _scaled(self.take(motion.pitch)[0], axis)
-            return rotation, _scaled(q[first], along), [(along, axis)]
+            along = scaled(self.take(motion.pitch)[0], axis)
+            return rotation, scaled(q[first], along), [(along, axis)]
         if kind == "prismatic":
             axis = self.vector(motion.axis)
-            return units, _scaled(q[first], axis), [(axis, none)]
+            return units, scaled(q[first], axis), [(axis, none)]
         shifts = [(unit, none) for unit in units]
         turns = [(none, unit) for unit in units]
         if kind == "translation":
@@ -349,91 +282,111 @@ class _Trace:
         parent = self.ground if motion.parent < 0 else self.bodies[motion.parent]
         placed, at = self.placement(motion.placement)
         turned, moved, subspace = self._joint(motion)
-        before = _product(parent.rotation, placed)
-        rotation = _product(before, turned)
-        origin = _add(parent.point(at), _times(before, moved))
+        before = product(parent.rotation, placed)
+        rotation = product(before, turned)
+        origin = add(parent.point(at), times(before, moved))
         own = []
         linear, angular = self.nothing, self.nothing
         for i, (shift, turn) in enumerate(subspace, motion.in_v):
-            ahead, about = _times(rotation, shift), _times(rotation, turn)
-            column = _Column(i, _add(ahead, _cross(origin, about)), about)
+            ahead, about = times(rotation, shift), times(rotation, turn)
+            column = Column(i, add(ahead, cross(origin, about)), about)
             own.append(column)
-            linear = _add(linear, _scaled(self.v[i], column.linear))
-            angular = _add(angular, _scaled(self.v[i], column.angular))
+            linear = add(linear, scaled(self.v[i], column.linear))
+            angular = add(angular, scaled(self.v[i], column.angular))
         spin = parent.spin
-        bias = _add(_cross(spin, linear), _cross(parent.velocity, angular))
+        bias = add(cross(spin, linear), cross(parent.velocity, angular))
+        spin_bias = cross(spin, angular)
+        for column in own:
+            a = self.accelerations[column.in_v]
+            bias = add(bias, scaled(a, column.linear))
+            spin_bias = add(spin_bias, scaled(a, column.angular))
         self.bodies.append(
-            _Body(
+            Body(
                 rotation,
                 origin,
-                _add(parent.velocity, linear),
-                _add(spin, angular),
-                _add(parent.bias, bias),
-                _add(parent.spin_bias, _cross(spin, angular)),
+                add(parent.velocity, linear),
+                add(spin, angular),
+                add(parent.bias, bias),
+                add(parent.spin_bias, spin_bias),
             )
         )
         self.columns.append(own)
 
     # -- inertia
 
-    def _inertia(self, motion: Motion, body: _Body) -> _Inertia:
+    def _inertia(self, motion: Motion, body: Body) -> Inertia:
         mass, x, y, z, *moments = self.take(motion.inertia)
-        own = _Moments(*moments)
+        own = Moments(*moments)
         if not own.is_zero:
             R = body.rotation
-            T = _product(_product(R, own.matrix), _transposed(R))
-            own = _Moments(T[0][0], T[0][1], T[0][2], T[1][1], T[1][2], T[2][2])
-        return _Inertia(mass, body.point((x, y, z)), own)
+            T = product(product(R, own.matrix), transposed(R))
+            own = Moments(T[0][0], T[0][1], T[0][2], T[1][1], T[1][2], T[2][2])
+        return Inertia(mass, body.point((x, y, z)), own)
 
-    def _force(self, body: _Body, inertia: _Inertia) -> tuple[Vector, Vector]:
+    def _force(self, body: Body, inertia: Inertia) -> tuple[Vector, Vector]:
         """The wrench about the world's origin that accelerates a body."""
         force, moment = self.nothing, self.nothing
         if not inertia.mass.is_zero:
-            force = _scaled(inertia.mass, body.point_bias(inertia.centre))
-            moment = _cross(inertia.centre, force)
+            force = scaled(inertia.mass, body.point_bias(inertia.centre))
+            moment = cross(inertia.centre, force)
         if not inertia.moments.is_zero:
             momentum = inertia.moments.times(body.spin)
-            moment = _add(moment, inertia.moments.times(body.spin_bias))
-            moment = _add(moment, _cross(body.spin, momentum))
+            moment = add(moment, inertia.moments.times(body.spin_bias))
+            moment = add(moment, cross(body.spin, momentum))
         return force, moment
 
     def tree(self) -> None:
         """Kinematics, and the outputs M and nle."""
-        motions, nv = self.structure.motions, self.structure.nv
-        for motion in motions:
+        self.move()
+        self._mass_matrix()
+        self.outputs += [Output(f"nle[{i}]", x) for i, x in enumerate(self.inverse_dynamics())]
+
+    def move(self) -> None:
+        """Bodies, their columns and their inertias."""
+        for motion in self.structure.motions:
             self._move(motion)
-        own = [self._inertia(motion, body) for motion, body in zip(motions, self.bodies)]
-        wrenches = [self._force(body, inertia) for body, inertia in zip(self.bodies, own)]
-        composite = list(own)
-        armature = self.take(self.structure.armature)
-        nle = [self.recorder.zero] * nv
+        pairs = zip(self.structure.motions, self.bodies)
+        self.inertias = [self._inertia(motion, body) for motion, body in pairs]
+
+    def inverse_dynamics(self) -> list[Expression]:
+        """The forces (nv) that the accelerations take, without armature: of none, those of gravity
+        and velocities."""
+        motions = self.structure.motions
+        wrenches = [self._force(body, own) for body, own in zip(self.bodies, self.inertias)]
+        out = [self.recorder.zero] * self.structure.nv
         for number in range(len(motions) - 1, -1, -1):
             parent = motions[number].parent
             force, moment = wrenches[number]
-            subtree = composite[number]
             for column in self.columns[number]:
-                nle[column.in_v] = _dot(column.linear, force) + _dot(column.angular, moment)
-                self._mass_column(column, number, subtree, armature)
+                out[column.in_v] = dot(column.linear, force) + dot(column.angular, moment)
             if parent >= 0:
-                composite[parent] = composite[parent].plus(subtree)
                 above = wrenches[parent]
-                wrenches[parent] = _add(above[0], force), _add(above[1], moment)
-        self.outputs += [Output(f"nle[{i}]", value) for i, value in enumerate(nle)]
+                wrenches[parent] = add(above[0], force), add(above[1], moment)
+        return out
+
+    def _mass_matrix(self) -> None:
+        composite, armature = list(self.inertias), self.take(self.structure.armature)
+        for number in range(len(composite) - 1, -1, -1):
+            parent = self.structure.motions[number].parent
+            for column in self.columns[number]:
+                self._mass_column(column, number, composite[number], armature)
+            if parent >= 0:
+                composite[parent] = composite[parent].plus(composite[number])
 
     def _mass_column(
-        self, column: _Column, number: int, subtree: _Inertia, armature: list[Expression]
+        self, column: Column, number: int, subtree: Inertia, armature: list[Expression]
     ) -> None:
         """The entries of M of a column and those on the way to the ground."""
-        speed = _add(column.linear, _cross(column.angular, subtree.centre))
-        force = _scaled(subtree.mass, speed)
-        moment = _add(_cross(subtree.centre, force), subtree.moments.times(column.angular))
+        speed = add(column.linear, cross(column.angular, subtree.centre))
+        force = scaled(subtree.mass, speed)
+        moment = add(cross(subtree.centre, force), subtree.moments.times(column.angular))
         nv = self.structure.nv
         above = number
         while above >= 0:
             for other in self.columns[above]:
                 if other.in_v > column.in_v:
                     continue
-                value = _dot(other.linear, force) + _dot(other.angular, moment)
+                value = dot(other.linear, force) + dot(other.angular, moment)
                 if other.in_v == column.in_v:
                     value = value + armature[column.in_v]
                 self.outputs.append(Output(f"M[{column.in_v * nv + other.in_v}]", value))
@@ -443,10 +396,17 @@ class _Trace:
 
     def rows(self) -> None:
         """The outputs g, bias and G."""
-        columns = {column.in_v: column for own in self.columns for column in own}
-        g: dict[int, Expression] = {}
-        bias: dict[int, Expression] = {}
-        G: dict[int, dict[int, Expression]] = {}
+        g, bias, G = self.closure_rows()
+        for row in g:
+            self.outputs += [Output(f"g[{row}]", g[row]), Output(f"bias[{row}]", bias[row])]
+            self.outputs += [Output(f"G[{row}][{j}]", entry) for j, entry in G[row].items()]
+
+    def closure_rows(self) -> tuple[Row, Row, dict[int, Row]]:
+        """g, bias and the entries of G, by rows."""
+        columns = self.columns_by_rate()
+        g: Row = {}
+        bias: Row = {}
+        G: dict[int, Row] = {}
         for closure in self.structure.closures:
             self._positions(closure, columns, g, bias, G)
             self._alignments(closure, columns, g, bias, G)
@@ -459,29 +419,31 @@ class _Trace:
             zero = self.recorder.zero
             for j in changed:
                 G[row][j] = G[row].get(j, zero) - by * G[other].get(j, zero)
-        for row in g:
-            self.outputs += [Output(f"g[{row}]", g[row]), Output(f"bias[{row}]", bias[row])]
-            self.outputs += [Output(f"G[{row}][{j}]", entry) for j, entry in G[row].items()]
+        return g, bias, G
+
+    def columns_by_rate(self) -> dict[int, Column]:
+        """The columns of the world Jacobian, by the rate of each."""
+        return {column.in_v: column for own in self.columns for column in own}
 
     def _positions(
         self,
         closure: Closure,
-        columns: dict[int, _Column],
-        g: dict[int, Expression],
-        bias: dict[int, Expression],
-        G: dict[int, dict[int, Expression]],
+        columns: dict[int, Column],
+        g: Row,
+        bias: Row,
+        G: dict[int, Row],
     ) -> None:
         directions, distances = self.take(closure.directions), self.take(closure.distances)
         if not directions and not distances:
             return
         a, b = self.body(closure.joint_a), self.body(closure.joint_b)
         x = a.point(self.vector(closure.at_a))
-        apart = _subtract(x, b.point(self.vector(closure.at_b)))
-        rate = _subtract(a.point_velocity(x), b.point_velocity(x))
-        change = _subtract(a.point_bias(x), b.point_bias(x))
-        change = _subtract(change, _scaled(self.recorder.constant(2.0), _cross(b.spin, rate)))
+        apart = subtract(x, b.point(self.vector(closure.at_b)))
+        rate = subtract(a.point_velocity(x), b.point_velocity(x))
+        change = subtract(a.point_bias(x), b.point_bias(x))
+        change = subtract(change, scaled(self.recorder.constant(2.0), cross(b.spin, rate)))
         moved = [
-            (j, sign, _add(columns[j].linear, _cross(columns[j].angular, x)))
+            (j, sign, add(columns[j].linear, cross(columns[j].angular, x)))
             for j, sign in closure.support
         ]
         row = closure.first_row
@@ -489,52 +451,52 @@ class _Trace:
         def along(d: Vector, value: Expression, acceleration: Expression) -> None:
             nonlocal row
             g[row], bias[row] = value, acceleration
-            G[row] = {j: _dot(d, point) * float(sign) for j, sign, point in moved}
+            G[row] = {j: dot(d, point) * float(sign) for j, sign, point in moved}
             row += 1
 
         for k in range(0, len(directions), 3):
-            d = _times(b.rotation, (directions[k], directions[k + 1], directions[k + 2]))
-            along(d, _dot(d, apart), _dot(d, change))
+            d = times(b.rotation, (directions[k], directions[k + 1], directions[k + 2]))
+            along(d, dot(d, apart), dot(d, change))
         for k in range(0, len(distances), 2):
             length, factor = distances[k], distances[k + 1]
-            distance = self.recorder.call("sqrt", _dot(apart, apart))
+            distance = self.recorder.call("sqrt", dot(apart, apart))
             coincident = self.take(self.structure.coincident)[0]
             self.guards.append(Guard(distance, coincident * length))
-            d = _scaled(factor / distance, apart)
-            across = _cross(d, rate)
-            turning = _dot(across, across) / (factor * distance)
-            along(d, factor * (distance - length), _dot(d, change) + turning)
+            d = scaled(factor / distance, apart)
+            across = cross(d, rate)
+            turning = dot(across, across) / (factor * distance)
+            along(d, factor * (distance - length), dot(d, change) + turning)
 
     def _alignments(
         self,
         closure: Closure,
-        columns: dict[int, _Column],
-        g: dict[int, Expression],
-        bias: dict[int, Expression],
-        G: dict[int, dict[int, Expression]],
+        columns: dict[int, Column],
+        g: Row,
+        bias: Row,
+        G: dict[int, Row],
     ) -> None:
         numbers = self.take(closure.alignments)
         a, b = self.body(closure.joint_a), self.body(closure.joint_b)
-        w = _subtract(a.spin, b.spin)
-        change = _subtract(_subtract(a.spin_bias, b.spin_bias), _cross(b.spin, a.spin))
+        w = subtract(a.spin, b.spin)
+        change = subtract(subtract(a.spin_bias, b.spin_bias), cross(b.spin, a.spin))
         row = closure.first_row + closure.directions.length // 3 + closure.distances.length // 2
         for k in range(0, len(numbers), 6):
-            m = _times(a.rotation, (numbers[k], numbers[k + 1], numbers[k + 2]))
-            n = _times(b.rotation, (numbers[k + 3], numbers[k + 4], numbers[k + 5]))
-            moment = _cross(m, n)
-            turning = _add(_cross(change, m), _cross(w, _cross(w, m)))
-            g[row], bias[row] = _dot(n, m), _dot(n, turning)
+            m = times(a.rotation, (numbers[k], numbers[k + 1], numbers[k + 2]))
+            n = times(b.rotation, (numbers[k + 3], numbers[k + 4], numbers[k + 5]))
+            moment = cross(m, n)
+            turning = add(cross(change, m), cross(w, cross(w, m)))
+            g[row], bias[row] = dot(n, m), dot(n, turning)
             G[row] = {
-                j: _dot(moment, columns[j].angular) * float(sign) for j, sign in closure.support
+                j: dot(moment, columns[j].angular) * float(sign) for j, sign in closure.support
             }
             row += 1
 
     def _coordinates(
         self,
         own: CoordinateRow,
-        g: dict[int, Expression],
-        bias: dict[int, Expression],
-        G: dict[int, dict[int, Expression]],
+        g: Row,
+        bias: Row,
+        G: dict[int, Row],
     ) -> None:
         zero = self.recorder.zero
         coefficients, powers = self.take(own.coefficients), self.take(own.powers)
@@ -558,20 +520,21 @@ class _Trace:
             for b, j in zip(arguments, own.in_v):
                 entries[j] = entries[j] - slope * b
         g[own.row], G[own.row] = value, entries
-        bias[own.row] = -2.0 * (curvature * (rate * rate))
+        accelerated = sum((c * self.accelerations[j] for j, c in entries.items()), zero)
+        bias[own.row] = accelerated - 2.0 * (curvature * (rate * rate))
 
     def bushing_bodies(self) -> None:
         """The outputs B and J: placements and velocities in the axes of the bodies, and columns of
         the world Jacobian."""
         for k, joint in enumerate(self.structure.bushing_joints):
             body = self.body(joint)
-            inverse = _transposed(body.rotation)
-            velocity = _times(inverse, body.point_velocity(body.origin))
+            inverse = transposed(body.rotation)
+            velocity = times(inverse, body.point_velocity(body.origin))
             columns = [entry for column in inverse for entry in column]
-            motion = (*velocity, *_times(inverse, body.spin))
+            motion = (*velocity, *times(inverse, body.spin))
             for i, values in enumerate((columns, body.origin, motion), 3 * k):
                 self.outputs += [Output(f"B[{i}][{n}]", value) for n, value in enumerate(values)]
-        own = {column.in_v: column for columns in self.columns for column in columns}
+        own = self.columns_by_rate()
         for j in self.structure.bushing_columns:
             values = (*own[j].linear, *own[j].angular)
             self.outputs += [Output(f"J[{6 * j + n}]", value) for n, value in enumerate(values)]
@@ -579,20 +542,41 @@ class _Trace:
     # -- forces
 
     def forces(self) -> None:
-        """The outputs tau, which the terms add to."""
-        columns = {column.in_v: column for own in self.columns for column in own}
-        tau: dict[int, Expression] = {}
+        """The outputs tau and lawful, which the terms add to, own and values."""
+        tau, lawful, own = self.generalised_forces()
+        zero = self.recorder.zero
+        for j, value in own.items():
+            acting = self.recorder.choose(self.held, zero, value)
+            lawful[j] = lawful.get(j, zero) + acting
+        for name, forces in (("tau", tau), ("lawful", lawful)):
+            self.outputs += [
+                Output(f"{name}[{j}]", self.recorder.leaf(f"{name}[{j}]") + value)
+                for j, value in forces.items()
+                if not value.is_zero
+            ]
+        self.outputs += [Output(f"own[{j}]", value) for j, value in own.items()]
+
+    def generalised_forces(self) -> tuple[Row, Row, Row]:
+        """Those of elements without laws, and with laws between links, without bushings; and the
+        laws of coordinates."""
+        columns, zero = self.columns_by_rate(), self.recorder.zero
+        tau: Row = {}
+        lawful: Row = {}
+        own: Row = {}
         for force in self.structure.forces:
+            kind = FORCE_KINDS[force.kind]
+            to = tau if kind in LAWLESS else own if kind in ON_COORDINATES else lawful
             for j, value in self._generalised(force, columns):
-                tau[j] = tau.get(j, self.recorder.zero) + value
-        self.outputs += [
-            Output(f"tau[{j}]", self.recorder.leaf(f"tau[{j}]") + value)
-            for j, value in tau.items()
-            if not value.is_zero
-        ]
+                to[j] = to.get(j, zero) + value
+        return tau, lawful, own
+
+    def acting(self, law: int, value: Expression) -> Expression:
+        """The value of a law, or what is held in its place."""
+        self.outputs.append(Output(f"values[{law}]", value))
+        return self.recorder.choose(self.held, self.recorder.leaf(f"y[{law}]"), value)
 
     def _generalised(
-        self, force: Force, columns: dict[int, _Column]
+        self, force: Force, columns: dict[int, Column]
     ) -> list[tuple[int, Expression]]:
         """The generalised forces of an element, with their columns."""
         k, d, rest = self.take(force.coefficients)
@@ -610,18 +594,30 @@ class _Trace:
             for factor, i, j in zip(factors, force.positions, force.columns):
                 stretch = stretch + factor * self.q[i]
                 rate = rate + factor * self.v[j]
-            value = -(k * stretch + d * rate)
+            value = self.acting(force.held, -(k * stretch + d * rate))
             return [(j, factor * value) for j, factor in zip(force.columns, factors)]
         point, acting, moment = (
             self._wrench(force) if kind == "wrench" else self._spring(force, k, d, rest)
         )
-        about_origin = _add(moment, _cross(point, acting))
+        return self.moved_by(columns, force.columns, factors, point, acting, moment)
+
+    def moved_by(
+        self,
+        columns: dict[int, Column],
+        moving: Sequence[int],
+        factors: Sequence[Expression],
+        point: Vector,
+        force: Vector,
+        moment: Vector,
+    ) -> list[tuple[int, Expression]]:
+        """The generalised forces of a force at a point and a moment."""
+        about_origin = add(moment, cross(point, force))
         return [
             (
                 j,
-                factor * (_dot(columns[j].linear, acting) + _dot(columns[j].angular, about_origin)),
+                factor * (dot(columns[j].linear, force) + dot(columns[j].angular, about_origin)),
             )
-            for j, factor in zip(force.columns, factors)
+            for j, factor in zip(moving, factors)
         ]
 
     def _over_time(self, force: Force) -> list[Expression]:
@@ -649,14 +645,14 @@ class _Trace:
     def _frame(self, joint: int, placement: Span) -> tuple[Matrix, Vector]:
         body = self.body(joint)
         rotation, at = self.placement(placement)
-        return _product(body.rotation, rotation), body.point(at)
+        return product(body.rotation, rotation), body.point(at)
 
     def _wrench(self, force: Force) -> tuple[Vector, Vector, Vector]:
         """Point, force and moment of a wrench."""
         fx, fy, fz, mx, my, mz = self._over_time(force)
         rotation, at = self._frame(force.joint_a, force.at_a)
         if force.in_link_axes:
-            return at, _times(rotation, (fx, fy, fz)), _times(rotation, (mx, my, mz))
+            return at, times(rotation, (fx, fy, fz)), times(rotation, (mx, my, mz))
         return at, (fx, fy, fz), (mx, my, mz)
 
     def _spring(
@@ -666,26 +662,37 @@ class _Trace:
         a, b = self.body(force.joint_a), self.body(force.joint_b)
         _, at_a = self._frame(force.joint_a, force.at_a)
         _, at_b = self._frame(force.joint_b, force.at_b)
-        apart = _subtract(at_a, at_b)
-        length = self.recorder.call("sqrt", _dot(apart, apart))
-        factor = -k
-        if not rest.is_zero:
-            coincident = self.take(self.structure.coincident)[0]
-            self.guards.append(Guard(length, coincident * rest))
-            factor = factor * (1.0 - rest / length)
-        acting = _scaled(factor, apart)
-        if not d.is_zero:
-            rate = _subtract(a.point_velocity(at_a), b.point_velocity(at_b))
-            along = _scaled(_dot(_scaled(1.0 / length, apart), rate) / length, apart)
-            # Points that meet move along the line that joins them.
-            choose = self.recorder.choose
-            along = (
-                choose(length, along[0], rate[0]),
-                choose(length, along[1], rate[1]),
-                choose(length, along[2], rate[2]),
-            )
-            acting = _subtract(acting, _scaled(d, along))
-        return at_a, acting, self.nothing
+        apart = subtract(at_a, at_b)
+        if d.is_zero:
+            rate = self.nothing
+        else:
+            rate = subtract(a.point_velocity(at_a), b.point_velocity(at_b))
+        if force.held < 0:
+            return at_a, self._spring_without_length(apart, rate, k, d), self.nothing
+        length = self.recorder.call("sqrt", dot(apart, apart))
+        coincident = self.take(self.structure.coincident)[0]
+        self.guards.append(Guard(length, coincident * rest))
+        line = scaled(1.0 / length, apart)
+        value = -(k * (length - rest) + d * dot(line, rate))
+        return at_a, scaled(self.acting(force.held, value), line), self.nothing
+
+    def _spring_without_length(
+        self, apart: Vector, rate: Vector, k: Expression, d: Expression
+    ) -> Vector:
+        """Its force, which has no direction of its own where the points meet."""
+        acting = scaled(-k, apart)
+        if d.is_zero:
+            return acting
+        length = self.recorder.call("sqrt", dot(apart, apart))
+        along = scaled(dot(scaled(1.0 / length, apart), rate) / length, apart)
+        # Points that meet move along the line that joins them.
+        choose = self.recorder.choose
+        along = (
+            choose(length, along[0], rate[0]),
+            choose(length, along[1], rate[1]),
+            choose(length, along[2], rate[2]),
+        )
+        return subtract(acting, scaled(d, along))
 
 
 FORCE_KINDS = (
@@ -693,6 +700,10 @@ FORCE_KINDS = (
     "coupling_spring",
 )
 """As forces.hpp numbers them."""
+LAWLESS = ("joint_torque", "wrench")
+"""Those that neither damp nor store energy."""
+ON_COORDINATES = ("torsion_spring", "limit_spring")
+"""Those whose law is that of a coordinate."""
 
 
 class RecordedTerms(NamedTuple):
@@ -729,7 +740,7 @@ def record_terms(structure: Structure) -> RecordedTerms:
     UnsupportedElementError
         If two points of an element coincide in every configuration.
     """
-    trace = _Trace(structure)
+    trace = Trace(structure)
     try:
         trace.tree()
         trace.rows()
@@ -742,60 +753,3 @@ def record_terms(structure: Structure) -> RecordedTerms:
     return RecordedTerms(
         trace.parameters, trace.q, trace.v, trace.outputs, trace.guards, *directions
     )
-
-
-class Source(NamedTuple):
-    """The C of a structure, and the number of its statements."""
-
-    text: str
-    operations: int
-
-
-def source_of(structure: Structure) -> Source:
-    """The C source of the terms of ``structure``.
-
-    It defines ``srm_mbs_sizes``, the sizes of its arguments; ``srm_mbs_constants``, which computes
-    k from the parameters p; ``srm_mbs_terms``, of an evaluation; ``srm_mbs_factor``, its algebra
-    (generated.hpp).
-
-    Raises
-    ------
-    UnsupportedElementError
-        If two points of an element coincide in every configuration.
-    """
-    recorded = record_terms(structure)
-    written = write_c(recorded.outputs, recorded.guards)
-    laws = sum(force.laws.length for force in structure.forces)
-    sizes = (
-        *(ABI, structure.nq, structure.nv, structure.rows, structure.rank),
-        *(len(structure.codes), written.constant_count, laws, len(structure.bushing_joints)),
-    )
-    text = _TEMPLATE.format(
-        sizes=", ".join(map(str, sizes)), constants=written.constants, terms=written.terms
-    )
-    text += algebra_of(structure.nv, structure.rows, structure.rank)
-    return Source(text, written.operations)
-
-
-_TEMPLATE = """\
-/* Terms of a mechanism, generated by srm-mbs.
- *
- * q, v: coordinates and rates; p: parameters; k: what depends on them alone; s: values of laws.
- * M: upper triangle, column by column; nle, tau, g, bias; G[row][column]; B, J: kinematics of
- * the bodies of bushings. */
-#include <math.h>
-
-const int srm_mbs_sizes[] = {{{sizes}}};
-
-void srm_mbs_constants(const double *restrict p, double *restrict k) {{
-{constants}
-}}
-
-int srm_mbs_terms(const double *restrict q, const double *restrict v, const double *restrict k,
-                  const double *restrict s, double *restrict M, double *restrict nle,
-                  double *restrict tau, double *restrict g, double *restrict bias,
-                  double *const *G, double *const *B, double *J) {{
-{terms}
-  return 0;
-}}
-"""

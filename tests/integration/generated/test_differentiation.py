@@ -68,6 +68,9 @@ def test_what_does_not_move_has_no_derivative(recorder: Recorder, x: Expression)
     assert count_derivatives([still * x], [{x: recorder.one}, {y: recorder.one}]) == 3
 
 
+NAMES = ("M", "nle", "g", "bias", "G")
+
+
 class _Terms:
     """The recorded terms of a mechanism without laws over time, and their derivatives by q and v,
     as arrays of numbers."""
@@ -77,11 +80,13 @@ class _Terms:
         constants = self.system.constants()
         self.structure, self.p = structure_of(mechanism.model, constants)
         self.terms = record_terms(self.structure)
+        # Forces also depend on laws that act.
+        self.outputs = [o for o in self.terms.outputs if o.target.split("[")[0] in NAMES]
         self.nv, self.rows = self.structure.nv, self.structure.rows
         self.by_state = self._along([*self.terms.along_q, *self.terms.along_v])
 
     def _along(self, directions: list[Direction]) -> list[list[Expression]]:
-        return derivatives([out.value for out in self.terms.outputs], directions)
+        return derivatives([out.value for out in self.outputs], directions)
 
     def _leaves(self, q: FloatArray, v: FloatArray) -> dict[Expression, float]:
         terms = self.terms
@@ -95,10 +100,9 @@ class _Terms:
         nv, rows = self.nv, self.rows
         out = {"M": np.zeros(nv * nv), "nle": np.zeros(nv), "G": np.zeros((rows, nv))}
         out |= {"g": np.zeros(rows), "bias": np.zeros(rows)}
-        for (target, _), value in zip(self.terms.outputs, values):
+        for (target, _), value in zip(self.outputs, values):
             name, *places = target.replace("]", "").split("[")
-            if name in out:
-                out[name][tuple(map(int, places))] = value
+            out[name][tuple(map(int, places))] = value
         upper = out["M"].reshape(nv, nv)  # column by column
         return out | {"M": upper + np.tril(upper, -1).T}
 
@@ -108,7 +112,7 @@ class _Terms:
         """Of each term, its derivatives in one more, last dimension."""
         rows = self.by_state if along is None else self._along(along)
         flat = values_of([value for row in rows for value in row], self._leaves(q, v))
-        count = len(self.terms.outputs)
+        count = len(self.outputs)
         each = [self._arrays(flat[i : i + count]) for i in range(0, len(flat), count)]
         return {name: np.stack([own[name] for own in each], axis=-1) for name in each[0]}
 

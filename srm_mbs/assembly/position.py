@@ -11,6 +11,7 @@ The last part is about position limits of joints: which are violated, and assemb
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -46,6 +47,8 @@ SEARCH_STEPS = 200
 """Evaluations of the trust-region solve."""
 RESTART_STEPS = 100
 """The same of each restart, so that loops that cannot close are refused in reasonable time."""
+STEPS_TOGETHER = 25
+"""The same where groups of loops can be closed one by one."""
 POLISHING_EVALUATIONS = 61
 """Evaluations of Newton's iteration after it."""
 PERTURBATIONS = (0.05, 0.2, 0.5, 1.0, 1.5, 2.0)
@@ -85,6 +88,36 @@ class ClosureProblem(ClosureGeometry):
                 a, b = loop.resolve(self.model)
                 moves = support(self.model, a[0]) - support(self.model, b[0])
                 out[loop.name] = (a, b, moves)
+        return out
+
+    @cached_property
+    def groups(self) -> list[tuple[list[int], IndexArray]]:
+        """Numbers of the loops, and velocity indices of the coordinates that move them, of the
+        smallest groups of loops that share no coordinate: each closes by itself."""
+        out: list[tuple[list[int], set[int]]] = []
+        for number, loop in enumerate(self.mechanism.loops):
+            if loop.joints is None:
+                (a, _), (b, _) = loop.resolve(self.model)
+                own = set(np.flatnonzero(support(self.model, a) != support(self.model, b)).tolist())
+            else:
+                own = {self.mechanism.joint(name).idx_v for name in loop.joints}
+            numbers = [number]
+            for group in [group for group in out if group[1] & own]:
+                out.remove(group)
+                numbers, own = [*group[0], *numbers], group[1] | own
+            out.append((sorted(numbers), own))
+        return [(numbers, np.array(sorted(own), dtype=int)) for numbers, own in out]
+
+    def part(self, numbers: list[int]) -> ClosureProblem:
+        """The closure equations of the loops of these ``numbers``, in the same units."""
+        loops = self.mechanism.loops
+        counts = np.cumsum([0, *(loop.rows.count for loop in loops)])
+        chosen = tuple(loops[number] for number in numbers)
+        out = ClosureProblem(replace(self.mechanism, loops=chosen), self.start)
+        out.units, out.unit, out.coordinate_unit = self.units, self.unit, self.coordinate_unit
+        out.row_unit = np.concatenate(
+            [self.row_unit[counts[number] : counts[number + 1]] for number in numbers]
+        )
         return out
 
     def mismatch(self, q: FloatArray) -> FloatArray:
@@ -287,19 +320,54 @@ def close_positions(
     return problem.unwrapped(found)
 
 
+def _close_by_groups(
+    problem: ClosureProblem, start: FloatArray, q: FloatArray, free: IndexArray
+) -> FloatArray:
+    """The result of assembly from ``start`` (nq,), group by group, where all together did not
+    close from there, but ended in ``q``.
+
+    Groups that Newton's iteration closes from q stay there.  Of the others each is assembled by
+    itself, until one of them does not close.
+    """
+    open_groups = []
+    for numbers, columns in problem.groups:
+        part, own = problem.part(numbers), np.intersect1d(columns, free)
+        closer = polish(part, q, own) if len(own) else q
+        if part.closed(closer):
+            q = part.unwrapped(closer)
+        else:
+            open_groups.append((part, columns, own))
+    for part, columns, own in open_groups:
+        found = assemble_positions(part, start, own)
+        if np.linalg.norm(part.mismatch(found)) < np.linalg.norm(part.mismatch(q)):
+            q = q.copy()
+            for joint in list(problem.model.joints)[1:]:
+                if joint.idx_v in columns:
+                    q[joint.idx_q : joint.idx_q + joint.nq] = found[
+                        joint.idx_q : joint.idx_q + joint.nq
+                    ]
+        if not part.closed(found):
+            break
+    return q
+
+
 def assemble_positions(problem: ClosureProblem, start: FloatArray, free: IndexArray) -> FloatArray:
     """The closed configuration nearest to the guess ``start``, or the closest one to closed."""
     if not len(free):
         return start
     rng = np.random.default_rng(0)
+    together = len(problem.groups) == 1
 
     best, best_gap = start, float(np.linalg.norm(problem.mismatch(start)))
     for size in (0.0, *PERTURBATIONS):
         spread = rng.uniform(-size, size, len(free)) if size else np.zeros(len(free))
-        steps = RESTART_STEPS if size else SEARCH_STEPS
+        steps = RESTART_STEPS if size else SEARCH_STEPS if together else STEPS_TOGETHER
         q = close_positions(problem, problem.move(start, spread, free), free, steps)
         if problem.closed(q):
             break
+        if not together:
+            q = _close_by_groups(problem, start, q, free)
+            return onto_singular_point(problem, q, free) if problem.closed(q) else q
         gap = float(np.linalg.norm(problem.mismatch(q)))
         if gap < best_gap:
             best, best_gap = q, gap

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -751,3 +752,39 @@ def test_planar_loops_in_tilted_planes_take_any_rate(
     assert tilted.degrees_of_freedom == 1
     expected = srm.assemble(load("four_bar"), {"crank": 1.0}, {"crank": rate})
     np.testing.assert_allclose(tilted.v0, expected.v, rtol=1e-9)
+
+
+def four_bars(couplers: list[float]) -> dict[str, Any]:
+    """Arguments of srm.planar: linkages side by side with couplers of these lengths (m)."""
+    out: dict[str, Any] = {"points": {}, "bars": {}, "ground": (), "lengths": {}}
+    for i, coupler in enumerate(couplers):
+        left, A, B, right = (f"{name}{i}" for name in "OABC")
+        places = ((0.0, 0.0), (0.0, 0.4), (1.0, 0.8), (1.2, 0.0))
+        out["points"] |= {
+            name: (3.0 * i + x, z) for name, (x, z) in zip((left, A, B, right), places)
+        }
+        out["bars"] |= {f"crank{i}": (left, A), f"coupler{i}": (A, B), f"rocker{i}": (B, right)}
+        out["ground"] += (left, right)
+        out["lengths"][f"coupler{i}"] = coupler
+    return out | {"mass_per_length": 1.0}
+
+
+def test_loops_that_share_no_joint_close_by_themselves() -> None:
+    """Those beside a loop that cannot close are closed all the same, and the refusal is prompt."""
+    alone = {length: srm.planar(**four_bars([length])) for length in (1.1, 0.9, 1.3)}
+    lengths = [1.1, 0.9, 1.3] * 18
+    together = srm.planar(**four_bars(lengths))
+    for i, length in enumerate(lengths[:6]):
+        own = alone[length]
+        for pin_ in "OAC":
+            here = together.joint(f"{pin_}{i}").idx_q
+            there = own.joint(f"{pin_}0").idx_q
+            assert together.q0[here] == pytest.approx(own.q0[there], abs=1e-2)
+    lengths[7] = 9.0
+    started = time.process_time()
+    with pytest.raises(srm.AssemblyError) as caught:
+        srm.planar(**four_bars(lengths))
+    assert time.process_time() - started < 3.0
+    gaps = {name: gap for name, (gap, _) in caught.value.residuals.items()}
+    assert gaps.pop("B7") == pytest.approx(9.0 - np.hypot(1.2, 0.0) - 0.4 - np.hypot(0.2, 0.8))
+    assert max(gap for gap in gaps.values() if gap is not None) < 1e-12

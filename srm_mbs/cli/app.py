@@ -163,6 +163,8 @@ def simulate(
     html: Html = None,
     image: playback.Image = None,
     at: playback.At = None,
+    size: playback.Size = None,
+    dpi: playback.Dpi = None,
     video: playback.Video = None,
     trace: playback.Trace = None,
     gaps: playback.Gaps = False,
@@ -229,7 +231,8 @@ def simulate(
         check_output(plot, "--plot", FORMATS)
     check_output(csv, "--csv", (".csv",))
     check_output(html, "--html", HTML_SUFFIXES)
-    playback.check_pictures(image, at, video)
+    picture = playback.image_options(image, at, size, dpi)
+    playback.check_video(video)
 
     mechanism = _started(file.load(base=base, gravity=_vector(gravity, "--gravity")), q, v)
     overlays = playback.overlay_options(mechanism, trace, gaps, reactions, arrows)
@@ -276,7 +279,7 @@ def simulate(
             (plot, solution.plot),
             (csv, partial(solution.to_csv, points=added)),
             (html, partial(solution.export_html, **overlays)),
-            (image, partial(solution.export_image, t=at, **overlays)),
+            (image, partial(solution.export_image, **picture, **overlays)),
             (video, partial(solution.export_video, progress=True, **overlays)),
         ]
     )

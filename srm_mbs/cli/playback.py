@@ -38,6 +38,19 @@ Image = Annotated[Path | None, option("FILE.png", "Write a picture of the run at
 At = Annotated[
     float | None, option("S", "Time of the picture in the run (s).", show_default="the end")
 ]
+Size = Annotated[
+    str | None,
+    option(
+        "column|page|W,H",
+        "Size of the picture of --image: that of a journal's column or page, or width and height "
+        "in pixels, with --dpi in inches.",
+        show_default="900,600",
+    ),
+]
+Dpi = Annotated[
+    float | None,
+    option("N", "Dots per inch of the picture of --image.", show_default="300 for column and page"),
+]
 Video = Annotated[
     Path | None,
     option("FILE", "Write a film of the run as .gif or .mp4, or its pictures into this folder."),
@@ -63,13 +76,56 @@ Arrows = Annotated[
 ]
 
 
-def check_pictures(image: Path | None, at: float | None, video: Path | None) -> None:
-    """Refuse image and video files that cannot be written, before the run.
+def image_options(
+    image: Path | None, at: float | None, size: str | None, dpi: float | None
+) -> dict[str, Any]:
+    """The time and size of an image as options of ``export_image``, checked before the run.
 
     Raises
     ------
     InputError
-        If one cannot be written, its encoder is missing, or ``at`` is given without an image.
+        If the file cannot be written, the size is not valid, or one is given without an image.
+    """
+    from srm_mbs.visualization.animation.video import image_pixels
+
+    check_output(image, "--image", (".png",))
+    for name, given in (("--at", at), ("--size", size), ("--dpi", dpi)):
+        if image is None and given is not None:
+            raise InputError(
+                "it is about a picture, and none is asked for",
+                element=name,
+                remedy="Give --image FILE.png too",
+            )
+    options: dict[str, Any] = {"t": at, "dpi": dpi}
+    if size is not None:
+        options["size"] = size
+        if "," in size:
+            try:
+                numbers = tuple(float(number) for number in size.split(","))
+            except ValueError:
+                raise InputError(
+                    f"{size!r} is not a size", element="--size", remedy="Write 900,600 or column"
+                ) from None
+            whole = dpi is None and all(number.is_integer() for number in numbers)
+            options["size"] = tuple(int(number) for number in numbers) if whole else numbers
+    elif dpi is not None:
+        raise InputError(
+            "the size in inches is missing",
+            element="--dpi",
+            remedy="Give --size too, for example --size 3.5,2.5",
+        )
+    if size is not None:
+        image_pixels(options["size"], dpi)
+    return options
+
+
+def check_video(video: Path | None) -> None:
+    """Refuse a video file that cannot be written, before the run.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written, or its encoder is missing.
     """
     from srm_mbs.visualization.animation.video import (
         FILMS,
@@ -77,13 +133,6 @@ def check_pictures(image: Path | None, at: float | None, video: Path | None) -> 
         encoder_of,
     )
 
-    check_output(image, "--image", (".png",))
-    if image is None and at is not None:
-        raise InputError(
-            "it is the time of a picture, and none is asked for",
-            element="--at",
-            remedy="Give --image FILE.png too",
-        )
     if video is not None and not video.suffix:
         check_frames_folder(video, "--video")
     elif video is not None:
@@ -207,6 +256,8 @@ def play(
     run: Run,
     image: Image = None,
     at: At = None,
+    size: Size = None,
+    dpi: Dpi = None,
     video: Video = None,
     trace: Trace = None,
     gaps: Gaps = False,
@@ -218,7 +269,8 @@ def play(
 
     With --image or --video, write these instead.
     """
-    check_pictures(image, at, video)
+    picture = image_options(image, at, size, dpi)
+    check_video(video)
     solution = srm_mbs.load_solution(run, allow_outside=allow_outside)
     check_time(at, solution.span[1], solution.span[0])
     options = overlay_options(solution.mechanism, trace, gaps, reactions, arrows)
@@ -227,7 +279,7 @@ def play(
         return
     written, failed = write_files(
         [
-            (image, partial(solution.export_image, t=at, **options)),
+            (image, partial(solution.export_image, **picture, **options)),
             (video, partial(solution.export_video, progress=True, **options)),
         ]
     )

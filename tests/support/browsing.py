@@ -82,6 +82,16 @@ POINT_OF = """([node, at]) => {
 """Where a point of a body is seen in the window (pixels)."""
 
 
+DRAWN = """() => {
+  const info = viewer.renderer.info;
+  info.autoReset = false;
+  info.reset();
+  viewer.render();  // with the pass of the shadows
+  return [info.render.calls, info.render.triangles];
+}"""
+"""Calls and triangles of one picture."""
+
+
 def bodies_in(page: Any, t: float | None = None) -> dict[str, Any]:
     """Placement (4, 4) of each body in a page or frame, at the animation's time ``t``."""
     found = page.evaluate(BODIES, t)

@@ -1,11 +1,12 @@
 """Images and videos of a run, rendered by a headless browser.
 
 Playwright opens the page of :func:`srm_mbs.visualization.animation.playback.export_html` in
-headless Chromium and takes a screenshot at each requested time.
+headless Chromium, which draws a picture at each requested time.
 """
 
 from __future__ import annotations
 
+import base64
 import io
 import math
 import os
@@ -50,19 +51,40 @@ TEMPORARY_PREFIX = "srm-mbs-"
 """Prefix of the names of temporary folders, which have the page and the profile of the browser."""
 LOCKING_TIME = 60.0
 """Age (s) of a temporary folder above which its program has locked it, unless it was killed."""
-_SMOOTH = """() => {
+_PREPARE = """async ([width, height, front]) => {
   viewer.renderer.setPixelRatio(2);
   viewer.set_3d_pane_size();
+  window.requestAnimationFrame = () => 0;  // pictures are drawn when they are taken,
+  viewer.renderer.domElement.style.display = "none";  // and not on the screen
+  const sheet = () => Object.assign(document.createElement("canvas"), { width, height });
+  const draw = (pen) => {
+    viewer.render();
+    pen.drawImage(viewer.renderer.domElement, 0, 0, width, height);
+  };
+  // What does not move is drawn once: the background, and the notes in front.
+  const back = sheet(), picture = sheet(), pen = picture.getContext("2d");
+  const parts = viewer.scene.children, shown = parts.map((part) => part.visible);
+  for (const part of parts) part.visible = false;
+  draw(back.getContext("2d"));
+  parts.forEach((part, i) => { part.visible = shown[i]; });
+  viewer.scene.background = null;
+  const notes = front && Object.assign(new Image(), { src: `data:image/png;base64,${front}` });
+  if (notes) await notes.decode();
+  window.photograph = (t) => {
+    seek(t);
+    pen.drawImage(back, 0, 0);
+    draw(pen);
+    if (notes) pen.drawImage(notes, 0, 0);
+    return picture.toDataURL("image/png").split(",")[1];
+  };
 }"""
-"""Twice as many pixels in each direction, which the browser averages: software rendering does not
-smooth the edges enough by itself."""
-_SEEK = """async t => {
-  viewer.animator.pause();
-  viewer.animator.seek(t);
-  viewer.set_dirty();
-  const frame = () => new Promise(resolve => requestAnimationFrame(resolve));
-  await frame(); await frame();
-}"""
+"""Twice as many pixels in each direction, which are averaged: software rendering does not smooth
+the edges enough by itself.  Most of the time of a picture goes into its pixels."""
+_FRAMES = """new Promise(resolve =>
+  requestAnimationFrame(() => requestAnimationFrame(resolve)))"""
+_FRONT = """html, body, #view { background: transparent !important; }
+canvas { visibility: hidden; }"""
+"""Style of the page without its picture."""
 BARE = "#bar, #corner, .dg { display: none !important; }"
 """Style of the page in images: no controls."""
 
@@ -216,13 +238,7 @@ def photographer(
     InputError
         If ``size`` is not valid, an overlay cannot be drawn, or Chromium or playwright is missing.
     """
-    width, height = size
-    if not (isinstance(width, int) and isinstance(height, int) and min(size) > 0):
-        raise InputError(
-            f"size = {safe_repr(size)} is not a width and a height in pixels",
-            element="size",
-            remedy="Give for example size=(900, 600)",
-        )
+    width, height = _checked_pixels(size)
     own = browser() if chromium is None else nullcontext(chromium)
     with private_folder() as folder, own as opened:
         file = folder / "page.html"
@@ -231,13 +247,17 @@ def photographer(
         page.goto(file.as_uri())
         page.wait_for_function("viewer.scene_tree.children.mechanism !== undefined")
         page.add_style_tag(content=style)
-        page.evaluate(_SMOOTH)
+        page.evaluate(_FRAMES)  # the page has taken its size, and the legend its bars
+        front = None
+        if page.evaluate("about.notes.length > 0"):
+            over = page.add_style_tag(content=_FRONT)
+            front = base64.b64encode(page.screenshot(omit_background=True)).decode("ascii")
+            over.evaluate("tag => tag.remove()")
+        page.evaluate(_PREPARE, [width, height, front])
         start = solution.span[0]
 
         def photograph(t: float) -> bytes:
-            page.evaluate(_SEEK, t - start)
-            picture: bytes = page.screenshot()
-            return picture
+            return base64.b64decode(page.evaluate("t => photograph(t)", t - start))
 
         yield photograph
         page.close()
@@ -289,13 +309,45 @@ def export_image(
             element="t",
             remedy="Give a time of the run",
         )
-    pixels: Any = size
-    density: float | None = None
-    if dpi is not None or isinstance(size, str):
-        pixels, density = _print(size, dpi)
+    pixels, density = image_pixels(size, dpi)
     with photographer(solution, pixels, 60.0, view, [t]) as photograph:
         picture = photograph(t)
     write_file(path, picture if density is None else _with_density(picture, density))
+
+
+def _checked_pixels(size: Any) -> tuple[int, int]:
+    """Width and height in pixels.
+
+    Raises
+    ------
+    InputError
+        Unless ``size`` is two positive whole numbers.
+    """
+    try:
+        width, height = size
+    except (TypeError, ValueError):
+        width = height = None
+    if not (isinstance(width, int) and isinstance(height, int) and min(width, height) > 0):
+        raise InputError(
+            f"size = {safe_repr(size)} is not a width and a height in pixels",
+            element="size",
+            remedy="Give for example size=(900, 600)",
+        )
+    return width, height
+
+
+def image_pixels(size: Any, dpi: float | None) -> tuple[tuple[int, int], float | None]:
+    """Pixels of an image of ``size``: pixels or a name, with ``dpi`` inches or a name; and its dots
+    per inch, None of pixels.
+
+    Raises
+    ------
+    InputError
+        As :func:`export_image` about its size.
+    """
+    if dpi is None and not isinstance(size, str):
+        return _checked_pixels(size), None
+    return _print(size, dpi)
 
 
 def _print(size: Any, dpi: float | None) -> tuple[tuple[int, int], float]:

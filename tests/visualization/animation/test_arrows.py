@@ -13,8 +13,10 @@ import srm_mbs as srm
 from srm_mbs.visualization.animation.arrows import CUT, LONGEST, Arrows
 from srm_mbs.visualization.animation.overlays import ViewOptions
 from srm_mbs.visualization.animation.scene import make_picture
+from srm_mbs.visualization.animation.video import BARE, photographer
 from tests.support.browsing import exported, placements
 from tests.support.bundled import load
+from tests.support.screenshots import pixels
 
 DRAWN = """async t => {
   seek(t);
@@ -226,3 +228,20 @@ def test_arrows_are_refused_where_no_forces_are_known() -> None:
         motion.show(arrows=True)
     with pytest.raises(srm.InputError, match="arrows"):
         ViewOptions(arrows="yes").check(mechanism)  # type: ignore[arg-type]
+
+
+@pytest.mark.browser
+def test_a_picture_has_the_arrows_of_its_time_and_their_legend(
+    browser: Any, driven: srm.Solution, tmp_path: Path
+) -> None:
+    """As a photograph of the page at that time, which shows both."""
+    view, size = ViewOptions(arrows=True), (300, 200)
+    with photographer(driven, size, 60.0, view, [0.3, 0.8], browser) as photograph:
+        pictures = [pixels(photograph(t)) for t in (0.3, 0.8)]
+    with exported(browser, tmp_path, driven, size, arrows=True, panel=False) as page:
+        page.add_style_tag(content=BARE)
+        page.evaluate("viewer.renderer.setPixelRatio(2); viewer.set_3d_pane_size()")
+        for t, picture in zip((0.3, 0.8), pictures):
+            page.evaluate(DRAWN, t)
+            assert np.abs(pixels(page.screenshot()) - picture).max() < 0.05
+    assert np.abs(pictures[0] - pictures[1]).max() > 0.5

@@ -14,7 +14,7 @@ from srm_mbs.formats.load import bundled_models
 from srm_mbs.visualization.animation.meshcat_scene import node_names
 from srm_mbs.visualization.animation.shapes import Mesh, visuals_of
 from srm_mbs.visualization.animation.trajectory import MAX_BODY_FRAMES
-from tests.support.browsing import assert_in_place, opened
+from tests.support.browsing import DRAWN, assert_in_place, opened
 from tests.support.bundled import load, problem
 
 FPS = 32.0
@@ -73,9 +73,12 @@ def test_the_page_is_small_needs_no_network_and_shows_every_body_in_its_place(
     end = solution.span[1]
     path = tmp_path / "page.html"
     solution.export_html(path, fps=FPS)
-    assert path.stat().st_size < 5e6
-    names = node_names(solution.mechanism)
-    drawn = {names[visual.joint] for visual in visuals_of(solution.mechanism)}
+    names, visuals = node_names(solution.mechanism), visuals_of(solution.mechanism)
+    meshes = [visual.shape for visual in visuals if isinstance(visual.shape, Mesh)]
+    # In single precision, as text of 6 bits each.
+    size = sum(4 * (mesh.vertices.size + mesh.faces.size) for mesh in meshes) * 8 // 6
+    assert path.stat().st_size - size < 2.5e6
+    drawn = {names[visual.joint] for visual in visuals}
     with opened(browser, path.as_uri()) as page:
         # On key frames: single precision; between them the browser goes straight.
         for t in {0.0, end, round(0.4 * end * FPS) / FPS}:
@@ -84,6 +87,9 @@ def test_the_page_is_small_needs_no_network_and_shows_every_body_in_its_place(
         assert reach.shape == (7, 3)
         assert reach.max() < 1.0
         assert reach[:, :2].max() > 0.3  # it is not a speck either
+        calls, triangles = page.evaluate(DRAWN)
+        assert calls < 300
+        assert triangles < 2e5
         if name in ("slider_crank", "stewart_platform"):
             page.set_viewport_size({"width": PHONE[0], "height": PHONE[1]})
             page.wait_for_function("away > 1.5")

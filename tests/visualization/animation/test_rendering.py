@@ -174,7 +174,7 @@ def test_a_film_without_its_encoder_and_a_time_without_its_picture_are_refused_b
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     for options, words in (
         (["--video", str(tmp_path / "film.mp4")], "ffmpeg, which is not installed"),
-        (["--at", "0.4"], "--at: it is the time of a picture, and none is asked for"),
+        (["--at", "0.4"], "--at: it is about a picture, and none is asked for"),
     ):
         said = run_command("simulate", "simple_pendulum", *options, status=2)
         assert words in said
@@ -219,6 +219,47 @@ def test_the_command_line_writes_pictures_of_a_run_and_of_a_saved_one(tmp_path: 
     run_command("play", saved, "--image", second, "--at", "0.4")
     a, b = (pixels(Path(name).read_bytes()) for name in (first, second))
     np.testing.assert_allclose(orange_at(a), orange_at(b), atol=0.5)
+
+
+@pytest.mark.browser
+def test_the_command_line_gives_an_image_its_size_for_print(tmp_path: Path) -> None:
+    from PIL import Image
+
+    saved = tmp_path / "run.npz"
+    run().save(saved)
+    for options, shape, dpi in (
+        (["--size", "column"], (1050, 700), 300.0),
+        (["--size", "3,2.5", "--dpi", "100"], (300, 250), 100.0),
+        (["--size", "320,200"], (320, 200), None),
+    ):
+        name = tmp_path / "print.png"
+        run_command("play", saved, "--image", name, "--at", "0.4", *options)
+        with Image.open(name) as picture:
+            assert picture.size == shape
+            found = picture.info.get("dpi")
+            assert found == (None if dpi is None else pytest.approx((dpi, dpi), abs=0.1))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--size", "column"], "--size: it is about a picture, and none is asked for"),
+        (["--dpi", "300"], "--dpi: it is about a picture, and none is asked for"),
+        (["--image", "a.png", "--dpi", "300"], "--dpi: the size in inches is missing"),
+        (["--image", "a.png", "--size", "9,x"], "--size: '9,x' is not a size"),
+        (["--image", "a.png", "--size", "0,600"], "is not a width and a height in pixels"),
+        (["--image", "a.png", "--size", "4.5,600"], "is not a width and a height in pixels"),
+        (["--image", "a.png", "--size", "poster"], "is not the size of a figure"),
+        (["--image", "a.png", "--size", "90,60", "--dpi", "300"], "larger than the browser draws"),
+    ],
+)
+def test_a_size_without_its_image_or_that_is_none_is_refused_before_the_run(
+    options: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = run_command("simulate", "simple_pendulum", *options, status=2)
+    assert words in said
+    assert "steps" not in said
 
 
 def test_an_unknown_kind_of_film_is_refused_before_the_run(tmp_path: Path) -> None:

@@ -103,11 +103,15 @@ Change = Callable[[Element, Element], object]
 """Changes an element, given with its parent."""
 
 
+READ_ONCE = ("origin", "parent", "child", "axis", "dynamics")
+"""Elements of a joint of which one is read if the others are equal."""
+
+
 def changes(parent: Element, node: Element) -> Iterator[tuple[str, bool, Change]]:
     """What is done to ``node``, and whether it must be refused."""
     yield "deleted", False, lambda parent, node: parent.remove(node)
-    # Two springs without a name are two springs.
-    twice = not node.tag.endswith("}linear_spring_damper")
+    # Two springs without a name are two springs; equal elements of a joint are read once.
+    twice = not node.tag.endswith("}linear_spring_damper") and node.tag not in READ_ONCE
     yield "twice", twice, lambda parent, node: parent.append(copy.deepcopy(node))
     # Elements of <gazebo> other than joints are ignored with a note.
     acts = parent.tag != "gazebo"

@@ -27,6 +27,7 @@ from srm_mbs.integration.messages import (
 )
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.reversals import ReversalSearch
 
 SMALLEST_STEP = 1e-14
 """Shortest step, over the length of the run."""
@@ -300,7 +301,7 @@ def integrate(
     t, x = t0, state
     unevaluated: RunFailure | None = None
     redone = False
-    jump = JumpSearch(system)
+    jump = JumpSearch(system, norm)
     if breakpoints is not None:
         control.set_target_time(breakpoints.end)
 
@@ -390,7 +391,7 @@ def integrate(
                 if record.stop is not None:
                     break
                 continue
-            if result is not None and jump.misses(proposal, result, control.adaptive):
+            if result is not None and jump.misses(proposal, memory, result, control.adaptive):
                 continue
             decision = control.decide(proposal, result)
             placement = "redone" if redone else "a priori" if proposal.placed else ""
@@ -475,10 +476,12 @@ def call_progress(tick: Tick, t: float, h: float, x: FloatArray) -> None:
 
 
 class JumpSearch:
-    """Looks for the end of a step that passes a jump of forces: on the jump.
+    """Looks for the end of a step that passes a jump of forces: on the jump, or beside the layer in
+    which the friction of a joint changes its sign (:mod:`srm_mbs.integration.reversals`).
 
     The step is made again with other lengths, by Newton's method for the time of the jump; the
-    forces are smooth over the step (:meth:`~srm_mbs.dynamics.system.System.begin_step`).
+    forces are smooth over the step (:meth:`~srm_mbs.dynamics.system.System.begin_step`).  A step
+    over a layer is cut, whatever its error: that is unknown.
 
     Attributes
     ----------
@@ -486,18 +489,23 @@ class JumpSearch:
         Longest next step (s).
     """
 
-    def __init__(self, system: System) -> None:
+    def __init__(self, system: System, norm: ErrorNorm) -> None:
         self._system = system
+        self._reversals = ReversalSearch(system, norm)
         self._on_jump = False
         self.limit, self._tries = np.inf, 0
 
-    def misses(self, proposal: Proposal, result: StepResult, adaptive: bool) -> bool:
-        """Whether the step is to be made again, with another length."""
+    def misses(
+        self, proposal: Proposal, memory: IntegratorState, result: StepResult, adaptive: bool
+    ) -> bool:
+        """Whether the step ``result`` from ``memory`` is to be made again, with another length."""
         h = proposal.h
         late = self._system.past_jump(proposal.t_new, result.state)
         self._on_jump = late == 0.0
-        if adaptive and not result.error_ratio <= 1.0:
+        turned = self._reversals.late(memory, result) if adaptive else -np.inf
+        if adaptive and not result.error_ratio <= 1.0 and not turned > 0.0:
             return False
+        late = max(late, turned)
         short = h == self.limit and -h < late < 0.0
         if self._tries == MAX_JUMP_STEPS or not (late > 0.0 or short):
             return False

@@ -26,6 +26,7 @@ from tests.support.stiff import (
     bushed_four_bar,
     bushed_reference,
     by_radau,
+    by_turns,
     driven_reference,
     follower,
     guided_four_bar,
@@ -333,6 +334,49 @@ def test_errors_of_runs_with_friction_are_within_ten_tolerances(rtol: float) -> 
     run = srm.simulate(replace(mechanism, model=model), 10.0, rtol=rtol)
     assert run.settings.stiff
     assert abs(run(times)[0][:, 0] - expected[:, 0]).max() < 10.0 * rtol
+
+
+@pytest.fixture(scope="module")
+def turning_four_bar() -> tuple[srm.Mechanism, FloatArray, FloatArray]:
+    """Joints turn back fifteen times; times, and positions by integration from turn to turn."""
+    mechanism, times = rubbing("four_bar", 0.5, 1e-5), np.linspace(0.1, 4.0, 40)
+    return mechanism, times, by_turns(mechanism, "crank", 0.5, times)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("rtol", [1e-4, 1e-5, 1e-6])
+def test_joints_that_turn_back_against_friction_keep_the_tolerance(
+    turning_four_bar: tuple[srm.Mechanism, FloatArray, FloatArray], rtol: float, backend: str
+) -> None:
+    mechanism, times, expected = turning_four_bar
+    run = srm.simulate(mechanism, 4.0, rtol=rtol, backend=backend)
+    assert abs(run(times)[0] - expected).max() < 10.0 * rtol
+    assert run.stats.rejected < 0.2 * run.stats.steps
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6])
+def test_friction_sets_in_within_the_tolerance_where_a_motion_begins(
+    rtol: float, backend: str
+) -> None:
+    """A pendulum falls from rest, v_s = 1e-6: the friction is constant from the first moment."""
+    F = 0.5
+    mechanism = rubbing("simple_pendulum", F, 1e-6)
+    model = mechanism.model
+    data = model.createData()
+    falls = -np.sign(pin.computeGeneralizedGravity(model, data, mechanism.q0)[0])
+
+    def field(t: float, y: FloatArray) -> list[float]:
+        load = pin.computeGeneralizedGravity(model, data, y[:1])[0]
+        return [y[1], -load - falls * F]
+
+    times = np.linspace(0.05, 1.0, 20)
+    start = [mechanism.q0[0], 0.0]
+    expected = solve_ivp(field, (0.0, 1.0), start, "DOP853", times, rtol=1e-12, atol=1e-12).y
+    run = srm.simulate(mechanism, 1.0, v0=[0.0], rtol=rtol, backend=backend)
+    q, v = run(times)
+    assert abs(q[:, 0] - expected[0]).max() < 2.0 * rtol
+    assert abs(v[:, 0] - expected[1]).max() < 5.0 * rtol
 
 
 @pytest.mark.parametrize("friction", [0.5, 2.0])

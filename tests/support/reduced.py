@@ -158,9 +158,10 @@ class OneDegree:
     The other joints follow s by Newton on frame placements, their rates by least squares on frame
     Jacobians, q'' from classical accelerations; then, with q' = dq/ds,
 
-        q'^T M q' s'' = -q'^T (M q'' s'^2 + nle(q, q' s')).
+        q'^T M q' s'' = q'^T (tau - M q'' s'^2 - nle(q, q' s')).
 
-    Nothing of the package's closures, algebra or stepping is used; point and revolute closures.
+    ``force`` (nv,) is tau, by default 0.  Nothing of the package's closures, algebra or stepping is
+    used; point and revolute closures.
     """
 
     def __init__(self, mechanism: Mechanism, joint: str) -> None:
@@ -171,6 +172,7 @@ class OneDegree:
         self.loops = mechanism.loops
         self.q = np.array(mechanism.q0)
         self.others = [i for i in range(self.model.nv) if i != self.joint]
+        self.force = np.zeros(self.model.nv)
 
     def _rows(self, q: Any, v: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """g, G and Gdot v, in the world."""
@@ -223,18 +225,22 @@ class OneDegree:
                     break
         return q
 
-    def __call__(self, t: float, y: Any) -> list[float]:
-        s, rate = y
-        q = self.configuration(s)
-        _, G, _ = self._rows(q, np.zeros(self.model.nv))
+    def rates(self, s: float, rate: float) -> np.ndarray:
+        """v at s and s'."""
+        _, G, _ = self._rows(self.configuration(s), np.zeros(self.model.nv))
         along = np.zeros(self.model.nv)
         along[self.joint] = 1.0
         wanted = -G[:, self.joint]
         along[self.others] = np.linalg.lstsq(G[:, self.others], wanted, rcond=1e-9)[0]
-        v = along * rate
+        return along * rate
+
+    def __call__(self, t: float, y: Any) -> list[float]:
+        s, rate = y
+        along = self.rates(s, 1.0)
+        q, v = self.configuration(s), along * rate
         _, G, bias = self._rows(q, v)
         bend = np.zeros(self.model.nv)
         bend[self.others] = np.linalg.lstsq(G[:, self.others], -bias, rcond=1e-9)[0]
         nle = pin.nonLinearEffects(self.model, self.data, q, v)
         M = mass_matrix(self.model, q)
-        return [rate, float(-along @ (M @ bend + nle) / (along @ M @ along))]
+        return [rate, float(along @ (self.force - M @ bend - nle) / (along @ M @ along))]

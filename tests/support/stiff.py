@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
+from tests.support.reduced import OneDegree
 
 RATE = 5.0
 """Stiffness over damping of the bushing (1/s)."""
@@ -155,6 +156,47 @@ def rubbing(name: str, friction: float, speed: float) -> srm.Mechanism:
     model = mechanism.model.copy()
     model.friction = np.full(model.nv, friction)
     return replace(mechanism, model=model, friction_speed=speed)
+
+
+def by_turns(
+    mechanism: srm.Mechanism, joint: str, friction: float, times: FloatArray
+) -> FloatArray:
+    """Positions (k, nv) at ``times`` (k,) s of a mechanism with one degree of freedom and dry
+    ``friction`` in all joints: from one turn of a joint to the next the friction is constant.
+
+    That is the limit of F tanh(v / v_s), from which rates differ by some v_s.
+    """
+    equation = OneDegree(mechanism, joint)
+    signs = np.sign(mechanism.v0)
+    t, state = 0.0, np.array([mechanism.q0[equation.joint], mechanism.v0[equation.joint]])
+    found = [np.zeros((0, len(signs)))]
+    while t < times[-1]:
+        equation.force = -friction * signs
+
+        def turns(i: int, sign: float) -> Callable[[float, FloatArray], float]:
+            def turn(t: float, y: FloatArray) -> float:
+                return float(sign * equation.rates(*y)[i])
+
+            turn.terminal, turn.direction = True, -1.0  # type: ignore[attr-defined]
+            return turn
+
+        run = solve_ivp(
+            equation,
+            (t, times[-1]),
+            state,
+            "DOP853",
+            rtol=1e-9,
+            atol=1e-10,
+            events=[turns(i, sign) for i, sign in enumerate(signs)],
+            dense_output=True,
+        )
+        assert run.success
+        end = run.t[-1]
+        inside = times[(times > t) & (times <= end)]
+        found.append(np.array([equation.configuration(run.sol(at)[0]).copy() for at in inside]))
+        t, state = end, run.y[:, -1]
+        signs = np.where(np.abs(equation.rates(*state)) < 1e-7, -signs, signs)
+    return np.concatenate([rows for rows in found if len(rows)])
 
 
 def follower(rate: float) -> tuple[srm.Mechanism, Callable[..., FloatArray]]:

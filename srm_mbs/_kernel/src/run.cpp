@@ -9,6 +9,7 @@
 #include "errors.hpp"
 #include "interpreter.hpp"
 #include "linear.hpp"
+#include "reversals.hpp"
 
 namespace srm {
 
@@ -267,11 +268,28 @@ Stop Run::attempt(StepDecision& decision) {
     return t_ < t_end() ? Stop::chunk : Stop::finished;
 }
 
-// Whether the step is to be made again, with another length, because of a jump of forces.
+// ReversalSearch.late in integration/reversals.py.
+double Run::late_past_layers(const StepResult& r) const {
+    double late = -inf;
+    const int nv = system.nv;
+    for (int i = 0; system.has_friction() && i < nv; ++i) {
+        const double speed = system.friction_tolerance(i, 0.0);
+        if (!std::isfinite(speed)) continue;
+        const double scale = std::max(memory.state_scale[nv + i], r.state_scale[nv + i]);
+        late = std::max(late, late_past_layer(r.h, memory.rate[i], r.end_rate[i], speed,
+                                              step.norm.weight(nv + i, scale), constants()));
+    }
+    return late;
+}
+
+// Whether the step is to be made again, with another length: JumpSearch in integration/driver.py.
 bool Run::misses_jump(const Proposal& proposal, const StepResult& r) {
-    const double h = proposal.h, late = system.past_jump(proposal.t_new, r.state.data());
+    const double h = proposal.h;
+    double late = system.past_jump(proposal.t_new, r.state.data());
     on_jump_ = late == 0.0;
-    if (control->adaptive && !(r.error_ratio <= 1.0)) return false;
+    const double turned = control->adaptive ? late_past_layers(r) : -inf;
+    if (control->adaptive && !(r.error_ratio <= 1.0) && !(turned > 0.0)) return false;
+    late = std::max(late, turned);
     const bool is_short = h == jump_limit_ && -h < late && late < 0.0;
     if (jump_tries_ == constants().max_jump_steps || !(late > 0.0 || is_short)) return false;
     jump_limit_ = late < h ? h - late : 0.5 * h;

@@ -168,6 +168,7 @@ private:
     bool leaves_closures_open(const StepResult& result);
     std::optional<double> crossing(const StepResult& result) const;
     bool examine(double zero);
+    double late_past_layers(const StepResult& result) const;
     bool misses_jump(const Proposal& proposal, const StepResult& result);
     void follow(MotionAlongCurve motion);
     void prepare(const std::vector<PassagePoint>& points);

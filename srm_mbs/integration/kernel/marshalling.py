@@ -24,6 +24,7 @@ from srm_mbs.integration import (
     critical_passages,
     dense_output,
     driver,
+    reversals,
     singular_endpoints,
 )
 from srm_mbs.integration.breakpoints import SmoothIntervals
@@ -102,6 +103,9 @@ def constants() -> Any:
         power_iterations=stiffness.POWER_ITERATIONS,
         unresolved=stiffness.UNRESOLVED,
         reversal_share=stiffness.REVERSAL_SHARE,
+        friction_layer=reversals.LAYER,
+        layer_landing=reversals.LANDING,
+        layer_unresolved=reversals.UNRESOLVED,
         difference=linear_split_step.DIFFERENCE,
         time_difference=linear_split_step.TIME_DIFFERENCE,
         shortest_difference=linear_split_step.SHORTEST_DIFFERENCE,

@@ -27,7 +27,7 @@ OTHER_STEPS = 6
 NOT_STIFF = 2.0
 """h |lambda| of a linearly implicit step up to which an explicit one would do: it is stable for
 three times as long a step."""
-UNRESOLVED = 10.0
+UNRESOLVED = 2.0
 """Change of a rate over a step, in friction speeds, from which its stages miss the change of the
 friction."""
 REVERSAL_SHARE = 0.1

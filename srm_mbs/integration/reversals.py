@@ -1,0 +1,84 @@
+r"""Where a joint with friction turns back: steps end beside the layer of rates they do not resolve.
+
+Friction -F tanh(v / v_s) changes its sign within a few v_s.  Stages on both sides of that layer see
+a jump of the acceleration, of which an embedded pair, which takes the motion for smooth, finds a
+part by chance only: a quadrature with the nodes c_j and weights b_j across a jump at c errs by
+sum(b_j, c_j > c) - (1 - c) of the jump times the step, up to 4.2 for dop853.  So a step that would
+lead over the layer ends just before it, and the next one on its other side.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from srm_mbs.dynamics.system import System
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
+
+LAYER = 6.0
+"""Rate, in friction speeds, from which the friction is full but for 1e-5 of it."""
+LANDING = 2.0
+"""Rate, in layers, up to which a step ends that is to end beside one."""
+UNRESOLVED = 4.0
+"""Change of a rate, in layers, from which a step does not resolve the layer that it leads over."""
+
+
+class ReversalSearch:
+    """Looks for joints with friction that turn back in a step.
+
+    Parameters
+    ----------
+    system, norm
+        Of the run.
+    """
+
+    def __init__(self, system: System, norm: ErrorNorm) -> None:
+        self._norm = norm
+        k = system.multiplier_part.start
+        self._speeds = system.friction_tolerance(np.zeros(k))[k:]
+        self._rubs = np.flatnonzero(np.isfinite(self._speeds))
+        self._k = k
+
+    def late(self, memory: IntegratorState, result: StepResult) -> float:
+        """Time (s) by which the step ``result`` from ``memory`` leads too far over a layer: 0 where
+        it ends beside that, negative before it, -infinity where nothing turns back."""
+        if not self._rubs.size:
+            return -np.inf
+        weights = self._norm.weights(np.maximum(memory.state_scale, result.state_scale))
+        return max(
+            late_past_layer(
+                result.h,
+                float(memory.rate[i]),
+                float(result.end_rate[i]),
+                LAYER * float(self._speeds[i]),
+                float(weights[self._k + i]),
+            )
+            for i in self._rubs.tolist()
+        )
+
+
+def late_past_layer(h: float, before: float, after: float, layer: float, tolerance: float) -> float:
+    """Time (s) by which a rate that changes from ``before`` to ``after`` in ``h`` (s) comes too
+    far; see :meth:`ReversalSearch.late`.
+
+    Parameters
+    ----------
+    layer
+        Rate from which the friction is full.
+    tolerance
+        Changes of the rate up to it do not matter.
+    """
+    far = LANDING * layer
+    target = 0.5 * (layer + far)
+    leaves = abs(before) < layer or (abs(before) <= far and before * after < 0.0)
+    side = np.copysign(1.0, after if leaves else before)
+    start, end = side * before, side * after
+    unresolved = abs(end - start) > max(UNRESOLVED * layer, tolerance)
+    if leaves:
+        if layer <= end <= far:
+            return 0.0
+        return h * (end - target) / (end - start) if end > far and unresolved else -np.inf
+    if not (start > far and end < start):
+        return -np.inf
+    if layer <= end <= far:
+        return 0.0
+    return h * (target - end) / (start - end) if end > far or unresolved else -np.inf

@@ -147,7 +147,7 @@ class UrdfMutator:
         if place.parent is None:
             return None
         place.parent.insert(list(place.parent).index(place.node), copy.deepcopy(place.node))
-        # Elements without others in them, equal to their neighbours, are read once, as urdfdom does.
+        # Equal elements without others in them are read once, as urdfdom does.
         once = place.parent is not root and not len(place.node)
         expectation = unchanged() if place.drawn or once else REFUSED
         return f"{place.path} duplicated", expectation, None, None

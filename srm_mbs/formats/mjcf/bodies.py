@@ -7,7 +7,7 @@ subtracted from its limits and from the rest position of its spring.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any
@@ -31,9 +31,6 @@ JOINT_TYPES = ("hinge", "slide", "ball", "free")
 MOST_REPLICATED = 2000
 """Number of elements that the replicates of a file add: a line of text makes no more than some
 hundred bodies, which load in two seconds."""
-TENDON_ROTOR = 2e-9
-"""Armature of a tendon that has none, over the inertia that its length moves: less than tolerances
-show."""
 REFUSED = {
     "flexcomp": "a deformable body",
     "composite": "a chain or net of bodies",
@@ -316,36 +313,6 @@ class BodyReader:
             self.joints.append(Joint(rotor, "fixed", name, rotor))
             self.compensated[rotor] = 1.0
             self.values.remark("the armature of a free joint is a body without weight", rotor)
-
-    def add_tendon(
-        self, name: str, terms: Mapping[str, float], properties: Mapping[str, float]
-    ) -> str:
-        """Add a joint whose position is the length of a fixed tendon, which a coupling has to
-        state, and return its name.
-
-        Parameters
-        ----------
-        name
-            Of the tendon.
-        terms
-            Joint -> factor of its position in the length, not zero.
-        properties
-            Fields of the :class:`Joint`.  Without armature it gets TENDON_ROTOR of the inertia that
-            the length moves.
-        """
-        joint = self._name(f"{name}::tendon", "")
-        if not properties["armature"]:
-            mobility, first = self._mobility()
-            moved = sum(c**2 * float(mobility[first[other]]) for other, c in terms.items())
-            properties = {**properties, "armature": TENDON_ROTOR / moved}
-        self.values.remark(
-            "friction, armature or slack of a tendon act on a joint of its own", joint
-        )
-        carrier = next(one.child for one in self.joints if one.name in terms)
-        self.bodies[joint] = Body(joint)
-        self.placements[joint] = self.placements[carrier]
-        self.joints.append(Joint(joint, "prismatic", carrier, joint, **properties))
-        return joint
 
     def rescale(self) -> None:
         """Scale all inertias so that the total mass is ``settotalmass``."""

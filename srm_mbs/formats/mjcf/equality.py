@@ -34,8 +34,6 @@ ACTING = {
     "armature": "",
 }
 """Attributes by which a tendon acts, and the flags that switch them off."""
-SPRING_DEPTH = 1e-3
-"""Length over which the spring of a slack tendon sets in smoothly, over its slack."""
 POLYNOMIALS = {"joint": JOINT_EQUALITY, "tendon": TENDON_EQUALITY}
 """Attributes of equality constraints between coordinates."""
 Placed = tuple[str, pin.SE3]
@@ -299,17 +297,10 @@ class EqualityReader:
             ends = [child.get("site", "") for child in node if child.tag == "site"]
             rest = given.numbers("springlength", (1, 2), "-1")
             between = node.tag == "fixed" or len(node) == len(ends) == 2
-            own = {"armature": armature, "damping": damping, "friction": friction}
-            if node.tag == "fixed":
-                if friction or armature or np.ptp(rest) != 0.0:
-                    self._tendon_joint(name, node, where, stiffness, rest, own)
-                else:
-                    self._fixed_spring(name, node, where, stiffness, damping, float(rest[0]))
-                continue
             for refused, problem in (
                 (not between, "it is a spring or damper that does not go between two sites"),
-                (friction, "its frictionloss would act along a line"),
-                (armature, "its armature would act along a line"),
+                (friction, "its frictionloss would act on several joints or along a line"),
+                (armature, "its armature would act on several joints or along a line"),
                 (np.ptp(rest) != 0.0, "its spring is slack between two lengths (springlength)"),
             ):
                 if refused:
@@ -317,6 +308,9 @@ class EqualityReader:
                         f"{problem}, which is not read by this version",
                         "Remove its stiffness, damping, frictionloss or armature",
                     )
+            if node.tag == "fixed":
+                self._fixed_spring(name, node, where, stiffness, damping, float(rest[0]))
+                continue
             (body_a, at_a), (body_b, at_b) = (self.site(end, where) for end in ends)
             length = float(rest[0])
             if length < 0.0:
@@ -340,7 +334,14 @@ class EqualityReader:
     ) -> None:
         """The spring and damper of a fixed tendon, whose length is a sum of joint positions; by
         default it is relaxed at the springrefs."""
-        terms, reference = self._terms(name, node, where)
+        references, factors = self.tree.references, self._coefficients(name, node)
+        for joint in factors:
+            if joint not in references:
+                problem = f"there is no hinge or slide {joint!r}"
+                raise self.values.unknown(where, problem, references)
+        terms = {joint: factor for joint, factor in factors.items() if factor}
+        if not terms:
+            raise self.values.fault(where, "its spring acts on no joint", "Remove its stiffness")
         if rest < 0.0:
             rest = sum(factor * self.tree.rests[joint] for joint, factor in terms.items())
         self.forces.append(
@@ -351,60 +352,9 @@ class EqualityReader:
                 "coefficients": list(terms.values()),
                 "stiffness": stiffness,
                 "damping": damping,
-                "rest": rest - reference,
+                "rest": rest - sum(terms[joint] * references[joint] for joint in terms),
             }
         )
-
-    def _terms(self, name: str, node: Element, where: str) -> tuple[dict[str, float], float]:
-        """Joints and factors of the length of a fixed tendon that acts, and its length at the
-        references."""
-        references, factors = self.tree.references, self._coefficients(name, node)
-        for joint in factors:
-            if joint not in references:
-                problem = f"there is no hinge or slide {joint!r}"
-                raise self.values.unknown(where, problem, references)
-        terms = {joint: factor for joint, factor in factors.items() if factor}
-        if not terms:
-            raise self.values.fault(where, "it acts on no joint", "Remove its stiffness")
-        return terms, sum(factor * references[joint] for joint, factor in terms.items())
-
-    def _tendon_joint(
-        self,
-        name: str,
-        node: Element,
-        where: str,
-        stiffness: float,
-        rest: FloatArray,
-        own: dict[str, float],
-    ) -> None:
-        """A fixed tendon with armature, friction, or a spring that is slack between two lengths, as
-        a joint of its own that a coupling moves: its position is the length of the tendon, from
-        that at the references."""
-        terms, reference = self._terms(name, node, where)
-        if rest.size == 1 and rest[0] < 0.0:
-            rest = np.array([sum(c * self.tree.rests[joint] for joint, c in terms.items())])
-        low, high = (float(rest[k]) - reference for k in (0, -1))
-        if low > high:
-            raise self.values.fault(where, "its springlength decreases", "Exchange the two")
-        slack = low < high
-        if not slack:
-            own = own | {"stiffness": stiffness, "rest": low}
-        joint = self.tree.add_tendon(name, terms, own)
-        self.loops.append(
-            {
-                "name": joint,
-                "type": "coupling",
-                "joints": [joint, *terms],
-                "coefficients": [1.0, *(-factor for factor in terms.values())],
-            }
-        )
-        if slack and stiffness:
-            spring = {"type": "limit_spring", "name": joint, "joint": joint, "stiffness": stiffness}
-            depth = SPRING_DEPTH * (high - low)
-            self.forces.append(spring | {"lower": low, "upper": high, "depth": depth})
-            self.values.remark(
-                f"the spring of a slack tendon sets in over {SPRING_DEPTH:g} of its slack", name
-            )
 
 
 def _point(placement: pin.SE3) -> pin.SE3:

@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
-from srm_mbs._typing import FloatArray
 from srm_mbs.visualization.animation.shapes import visuals_of
 from tests.integration.kernel.test_kernel import agree
 from tests.support.backends import on_both
@@ -87,15 +85,6 @@ CABLES = """<mujoco><worldbody>
       <joint joint="a" coef="-0.1"/></fixed>
     <fixed damping="3"><joint joint="e" coef="0.5"/><joint joint="b" coef="0.25"/></fixed></tendon>
   </mujoco>"""
-SLACK = """<mujoco><worldbody>
-  <body name="hub"><joint name="a" axis="0 1 0" ref="20" armature="0.1"/>
-    <geom type="capsule" size="0.1 0.2" pos="0.3 0 0.1"/>
-    <body name="arm" pos="0.5 0 0">
-      <joint name="b" axis="0 0 1" springref="-30"/>
-      <joint name="c" type="slide" axis="1 0 0" springref="0.1" ref="0.3"/>
-      <geom type="capsule" size="0.1 0.2" pos="0.3 0.1 0"/></body></body></worldbody>
-  <tendon><fixed name="cable" {}><joint joint="a" coef="0.4"/>
-      <joint joint="c" coef="2"/><joint joint="b" coef="-0.7"/></fixed></tendon></mujoco>"""
 FILES = {
     "tree": TREE,
     "cables": CABLES,
@@ -363,51 +352,3 @@ def test_a_knee_that_slides_moves_as_the_constrained_equations_have_it(
         kkt = np.block([[M, J.T], [J, np.zeros((1, 1))]])
         expected = np.linalg.solve(kkt, np.append(-state.qfrc_bias, -rate))[:3]
         np.testing.assert_allclose(acceleration, expected, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("tendon", "friction", "atol"),
-    [
-        ('armature="3" damping="2"', 0.0, 1e-8),
-        ('armature="3" stiffness="40" springlength="0.7"', 0.0, 1e-8),
-        ('frictionloss="6" stiffness="40"', 6.0, 1e-7),
-        ('damping="2" stiffness="300" springlength="0.6 0.8"', 0.0, 2e-4),
-        ('stiffness="300" springlength="0.6 0.8"', 0.0, 2e-4),
-    ],
-)
-def test_armature_friction_and_slack_of_a_fixed_tendon_act(
-    tendon: str, friction: float, atol: float, tmp_path: Path
-) -> None:
-    """The motion is that of MuJoCo's accelerations without its constraints, to which friction is
-    added as this package smooths it."""
-    path = tmp_path / "slack.xml"
-    path.write_text(SLACK.format(tendon))
-    mechanism = srm.load(path)
-    assert mechanism.degrees_of_freedom == 3
-    assert mechanism.joint_names == ("a", "b", "c", "cable::tendon")
-    rates = {"a": 1.0, "b": -2.0, "c": 1.5}
-    start = srm.assemble(mechanism, {"a": 0.0, "b": 0.0, "c": 0.0}, rates)
-    run = srm.simulate(mechanism, 0.5, q0=start.q, v0=start.v, rtol=1e-9)
-    assert run.success, run.message
-
-    theirs = mujoco.MjModel.from_xml_path(str(path))
-    theirs.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    state = mujoco.MjData(theirs)
-    factors, speed = np.array([0.4, -0.7, 2.0]), mechanism.friction_speed
-
-    def field(t: float, y: FloatArray) -> FloatArray:
-        state.qpos[:], state.qvel[:] = theirs.qpos0 + y[:3], y[3:]
-        mujoco.mj_forward(theirs, state)
-        M = np.zeros((3, 3))
-        mujoco.mj_fullM(theirs, state, M)
-        held = -friction * np.tanh(factors @ y[3:] / speed) * factors
-        return np.concatenate([y[3:], np.linalg.solve(M, state.qfrc_smooth + held)])
-
-    start_y = np.concatenate([np.zeros(3), list(rates.values())])
-    expected = solve_ivp(field, (0.0, 0.5), start_y, method="LSODA", rtol=1e-10, atol=1e-12)
-    found = np.array([float(run.joint(name)[0][-1]) for name in rates])
-    assert np.abs(expected.y[:3, -1]).max() > 0.2
-    np.testing.assert_allclose(found, expected.y[:3, -1], atol=atol)
-    lengths = [run.joint(name)[0] for name in rates]
-    np.testing.assert_allclose(run.joint("cable::tendon")[0], factors @ lengths, atol=1e-9)
-    assert run.energy_balance.relative < 1e-6

@@ -167,15 +167,10 @@ EQUALITIES = {
 
 
 TENDON = '<tendon><fixed {}><joint joint="{}" coef="{}"/></fixed></tendon>'
-LINE = (
-    '<tendon><spatial {}><site site="s"/><site site="s"/></spatial></tendon>'  # not looked up yet
-)
 TENDONS = {
-    "along a line with dead zone": LINE.format('stiffness="2" springlength="0 1"'),
-    "along a line with friction": LINE.format('frictionloss="2"'),
-    "along a line with armature": LINE.format('armature="2"'),
-    "of decreasing length": TENDON.format('stiffness="2" springlength="1 0"', "j", 1),
-    "with friction on no joint": TENDON.format('frictionloss="2"', "x", 1),
+    "with dead zone": TENDON.format('stiffness="2" springlength="0 1"', "j", 1),
+    "with friction": TENDON.format('frictionloss="2"', "j", 1),
+    "with armature": TENDON.format('armature="2"', "j", 1),
     "on no such joint": TENDON.format('stiffness="2"', "x", 1),
     "on no joint": TENDON.format('stiffness="2"', "j", 0),
 }

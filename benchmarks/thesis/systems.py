@@ -191,6 +191,7 @@ class CartesianPendulum:
 
     has_constraints = True
     singularities = None
+    branch_system = None
     carries_yhat = False
     predicts = True
     tangent_size = 4
@@ -220,6 +221,9 @@ class CartesianPendulum:
     def constraint_residual(self, t: float, state: FloatArray) -> float:
         """|g|."""
         return abs(float(state[:2] @ state[:2]) - 1.0)
+
+    def friction_tolerance(self, v: FloatArray) -> FloatArray:
+        return np.full(self.tangent_size, np.inf)
 
     def step_limit(self, state: FloatArray) -> float:
         """No limit."""

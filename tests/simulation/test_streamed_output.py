@@ -29,7 +29,7 @@ def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def streamed(run: srm.Solution) -> bool:
-    return run._steps is None
+    return run._run.steps is None
 
 
 @on_both

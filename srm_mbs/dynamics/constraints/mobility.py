@@ -181,7 +181,7 @@ def _carried_by_joints(
     if not any(dependent.size for _, dependent in found):
         return largest
     # Normalised rows are divided by their unit and their size, and so are their multipliers.
-    size = constraint_units(mechanism, geometry.units)
+    size = constraint_units(mechanism, geometry.units).copy()
     size[: len(geometry.row_size)] *= geometry.row_size
     placed = Placements.at(model, workspace(model), np.array([q for q, _ in found]))
     anchored = []

@@ -218,7 +218,8 @@ def test_a_continuous_joint_counts_its_turns_only_where_it_is_coupled(tmp_path: 
     plain = wheel("c", 0.1)
     limited = wheel("b", 0.2).replace("<axis", '<limit effort="4" velocity="5"/><axis')
     text = f"{GEAR}ratio = 2.0\n[initial]\nq = {{ b_joint = 31.0, c_joint = 31.0 }}\n"
-    mechanism = load(tmp_path, wheel("a", 0.5) + limited + plain, text)
+    with pytest.warns(srm.SrmWarning, match="more than two turns: angles are in rad"):
+        mechanism = load(tmp_path, wheel("a", 0.5) + limited + plain, text)
     kinds = [mechanism.joint(name) for name in ("a_joint", "b_joint", "c_joint")]
     assert [joint.nq for joint in kinds] == [1, 1, 2]
     assert mechanism.q0[kinds[0].idx_q] == pytest.approx(62.0, abs=1e-12)  # not unwound

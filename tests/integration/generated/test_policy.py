@@ -534,9 +534,14 @@ def test_a_worker_that_ends_ends_its_compiler(
     indented = BESIDE.replace("\n", "\n    ")
     script = tmp_path / "workers.py"
     script.write_text(
-        f"import multiprocessing\ndef work():\n    {indented}\nif __name__ == '__main__':\n"
-        "    for way in ('fork', 'spawn'):\n"
-        "        worker = multiprocessing.get_context(way).Process(target=work)\n"
+        "import multiprocessing, time\nfrom pathlib import Path\n"
+        f"calls = Path({str(calls)!r})\ndef work(number):\n    {indented}\n"
+        # The compiler has to have begun before it is ended.
+        "    while not (calls.exists() and len(calls.read_text().split()) == number):\n"
+        "        time.sleep(0.01)\n"
+        "if __name__ == '__main__':\n"
+        "    for number, way in enumerate(('fork', 'spawn'), 1):\n"
+        "        worker = multiprocessing.get_context(way).Process(target=work, args=(number,))\n"
         "        worker.start(); worker.join(); assert worker.exitcode == 0\n"
     )
     subprocess.run([sys.executable, str(script)], check=True)

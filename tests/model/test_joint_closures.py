@@ -297,8 +297,7 @@ def test_a_four_bar_whose_coupler_is_a_distance(backend: str) -> None:
     tension = np.array([law(x)[1] for x in np.hstack([run.q, run.v])])
     assert_close(run.reaction_multipliers["rod"][:, 0], tension, atol=1e-7)
     assert_close(np.linalg.norm(run.reactions["rod"][:, :3], axis=1), np.abs(tension), atol=1e-7)
-    forces, moments = np.split(np.abs(run.reactions["rod"]), [3], axis=1)
-    assert moments.max() < 1e-14 * forces.max()
+    assert not run.reactions["rod"][:, 3:].any()
 
 
 def geared_pair() -> srm.Mechanism:

@@ -26,16 +26,20 @@ class Expectation:
         Parts of the mechanism that may differ, because the mutated file legally says so.
     noted
         Further parts may differ if a note or a warning says that something is ignored.
+    remarked
+        Whether there must be such a note or warning.
     """
 
     loads: bool
     refused: bool
     changes: frozenset[str] = field(default_factory=frozenset)
     noted: bool = False
+    remarked: bool = False
 
 
 REFUSED = Expectation(loads=False, refused=True)
 REFUSED_OR_NOTED = Expectation(loads=True, refused=True, noted=True)
+THE_SAME_WITH_A_NOTE = Expectation(loads=True, refused=False, remarked=True)
 
 
 def unchanged(*but: str) -> Expectation:

@@ -97,6 +97,8 @@ def complaint(
             return f"loaded, but with the default written out it is {written_out}"
         if differs := differences(got, written_out):
             return f"differs in {differs} from the same with the default written out"
+    if expected.remarked and not got["remarks"] > original["remarks"]:
+        return "loaded without a note"
     if expected.noted and got["remarks"] > original["remarks"]:
         return None
     differs = differences(got, original) - expected.changes

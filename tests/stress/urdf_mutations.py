@@ -16,6 +16,7 @@ from tests.stress.mutation import (
     REFUSED,
     REFUSED_OR_NOTED,
     START,
+    THE_SAME_WITH_A_NOTE,
     TREE,
     Expectation,
     Files,
@@ -149,7 +150,9 @@ class UrdfMutator:
         place.parent.insert(list(place.parent).index(place.node), copy.deepcopy(place.node))
         # Equal elements without others in them are read once, as urdfdom does.
         once = place.parent is not root and not len(place.node)
-        expectation = unchanged() if place.drawn or once else REFUSED
+        expectation = THE_SAME_WITH_A_NOTE if once else REFUSED
+        if place.drawn:
+            expectation = unchanged()
         return f"{place.path} duplicated", expectation, None, None
 
     def rename_element(self, root: Element, place: Place, rng: np.random.Generator) -> Outcome:

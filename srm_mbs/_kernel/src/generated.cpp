@@ -8,7 +8,7 @@ namespace srm {
 
 namespace {
 
-constexpr int interface_version = 2;  // ABI in integration/generated/terms.py
+constexpr int interface_version = 2;  // ABI in integration/generated/source.py
 
 // Places in srm_mbs_sizes.
 enum Size {

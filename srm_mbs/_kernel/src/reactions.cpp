@@ -40,12 +40,14 @@ void wrench_on_b(const ClosureRows& closure, const pinocchio::Data& data, const 
     Vec force{}, moment{};
     for (std::size_t k = 0; k < closure.directions.size(); k += 3)
         force = force + *own++ * to_world(b.rotation, vec(&closure.directions[k]));
+    // The force of a distance goes through both origins.
+    moment = cross(gap, force);
     for (std::size_t k = 0; k < closure.distances.size(); k += 2)
         force = force + (*own++ / std::sqrt(dot(gap, gap))) * gap;
     for (std::size_t k = 0; k < closure.alignments.size(); k += 6)
         moment = moment + *own++ * cross(to_world(a.rotation, vec(&closure.alignments[k])),
                                          to_world(b.rotation, vec(&closure.alignments[k + 3])));
-    put(force, moment + cross(gap, force), out);
+    put(force, moment, out);
 }
 
 }  // namespace

@@ -747,7 +747,8 @@ bool System::derivatives(const double* state, const double* a, double* by_forces
     return true;
 }
 
-// From a change r = dr of the residual forces and c = dc of the rows' accelerations to da: M da + G^T dlam = -dr, G da = -dc.
+// From changes r = dr of the residual forces and c = dc of the rows' accelerations to da in r:
+// M da + G^T dlam = -dr, G da = -dc.
 void System::acceleration_of(double* r, const double* c) {
     for (int i = 0; i < nv; ++i) r[i] = -r[i];
     if (!closed_) {

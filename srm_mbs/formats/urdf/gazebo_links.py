@@ -23,7 +23,7 @@ from srm_mbs.model.anchors import WORLD
 from srm_mbs.model.reach import Reach
 
 VERSION = (1, 12)
-"""Of SDF, whose elements the links have."""
+"""Version of SDF, whose elements the links have."""
 HANGING = {"revolute": "revolute", "prismatic": "prismatic", "fixed": "fixed", "ball": "spherical"}
 """Types of joints on which a link may hang, and their types in a URDF."""
 

@@ -43,7 +43,7 @@ from srm_mbs.integration.generated.vectors import (
 
 MOST_STATEMENTS = 8000
 """Statements of derivatives, as :func:`count_derivatives` estimates them, up to which they are
-generated: they compile in 1 to 3 s."""
+generated: they compile in 1 to 3.5 s."""
 TURN_SIZE = 5
 """Numbers of each bushing: phi (3), c, and the derivative of c by the square of phi."""
 

@@ -425,6 +425,9 @@ def test_reactions_of_a_run_have_one_row_per_time_and_keep_the_runs_data() -> No
     assert_close(
         run.reactions["pin_1"][0], first["pin_1"], atol=1e-12 * np.abs(first["pin_1"]).max()
     )
+    by_reference = srm.simulate(mechanism, 0.2, rtol=1e-6, backend="python")
+    first, _ = at_state(mechanism, by_reference.q[0], by_reference.v[0])
+    np.testing.assert_array_equal(by_reference.reactions["pin_1"][0], first["pin_1"])
 
 
 def test_reactions_do_not_change_the_system_they_are_computed_with() -> None:

@@ -487,7 +487,8 @@ def test_a_fork_leaves_the_compilation_to_its_parent(
 
 
 BESIDE = """
-import sys, time
+import os, sys, time
+from pathlib import Path
 import srm_mbs as srm
 from srm_mbs.integration.generated import policy
 
@@ -496,7 +497,12 @@ mechanism = srm.load("four_bar")
 started = time.monotonic()
 while policy._job is None and srm.simulate(mechanism, 2.0).settings.backend == "kernel":
     assert time.monotonic() - started < 60.0
+calls = Path(os.environ["CC"]).with_name("calls")
+while str(policy._job.compilation._process.pid) not in calls.read_text().split():
+    assert time.monotonic() - started < 60.0
+    time.sleep(0.01)
 """
+"""A program in which a compiler of :func:`program` has begun beside the runs."""
 
 
 def test_a_program_that_ends_ends_the_compiler(
@@ -534,14 +540,9 @@ def test_a_worker_that_ends_ends_its_compiler(
     indented = BESIDE.replace("\n", "\n    ")
     script = tmp_path / "workers.py"
     script.write_text(
-        "import multiprocessing, time\nfrom pathlib import Path\n"
-        f"calls = Path({str(calls)!r})\ndef work(number):\n    {indented}\n"
-        # The compiler has to have begun before it is ended.
-        "    while not (calls.exists() and len(calls.read_text().split()) == number):\n"
-        "        time.sleep(0.01)\n"
-        "if __name__ == '__main__':\n"
-        "    for number, way in enumerate(('fork', 'spawn'), 1):\n"
-        "        worker = multiprocessing.get_context(way).Process(target=work, args=(number,))\n"
+        f"import multiprocessing\ndef work():\n    {indented}\nif __name__ == '__main__':\n"
+        "    for way in ('fork', 'spawn'):\n"
+        "        worker = multiprocessing.get_context(way).Process(target=work)\n"
         "        worker.start(); worker.join(); assert worker.exitcode == 0\n"
     )
     subprocess.run([sys.executable, str(script)], check=True)

@@ -486,7 +486,7 @@ def test_a_fork_leaves_the_compilation_to_its_parent(
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
-BESIDE = """
+RUNS = """
 import os, sys, time
 from pathlib import Path
 import srm_mbs as srm
@@ -497,6 +497,8 @@ mechanism = srm.load("four_bar")
 started = time.monotonic()
 while policy._job is None and srm.simulate(mechanism, 2.0).settings.backend == "kernel":
     assert time.monotonic() - started < 60.0
+"""
+BESIDE = f"""{RUNS}
 calls = Path(os.environ["CC"]).with_name("calls")
 while str(policy._job.compilation._process.pid) not in calls.read_text().split():
     assert time.monotonic() - started < 60.0
@@ -555,7 +557,7 @@ def test_a_worker_that_ends_ends_its_compiler(
 @pytest.mark.stress
 def test_of_many_processes_one_compiles(program: Callable[[str], Path], folder: Path) -> None:
     calls = program("sleep 1; exec CC")
-    script = BESIDE.replace("policy._job is None and ", "")
+    script = RUNS.replace("policy._job is None and ", "")
     programs = [subprocess.Popen([sys.executable, "-c", script]) for _ in range(3)]
     assert [one.wait() for one in programs] == [0, 0, 0]
     assert calls.read_text().count("\n") == 1

@@ -122,8 +122,10 @@ def _take(law: Law, key: str, above: float = -math.inf) -> float:
 
 
 def _list(law: Law, key: str, least: int) -> FloatArray:
-    """The list of numbers of ``law``, of which there are at least ``least``, as a new array."""
-    array = finite_array(getattr(law, key), (None,))
+    """The list of numbers of ``law``, of which there are at least ``least``, as an array that
+    nothing else changes: a new one, or that of :class:`Samples`."""
+    given = getattr(law, key)
+    array = finite_array(given, (None,), new=not isinstance(given, Samples))
     remedy = f"Give a list of finite numbers, at least {least}"
     if array is None:
         raise _fault(law, f"{key} is not a list of finite numbers", remedy)

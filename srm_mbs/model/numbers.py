@@ -16,8 +16,10 @@ LARGEST_MAGNITUDE = 1e30
 sums."""
 
 
-def finite_array(values: Any, shape: tuple[int | None, ...] | None = None) -> FloatArray | None:
-    """``values`` as a new array; None unless it is real, finite and of that shape.
+def finite_array(
+    values: Any, shape: tuple[int | None, ...] | None = None, *, new: bool = True
+) -> FloatArray | None:
+    """``values`` as an array; None unless it is real, finite and of that shape.
 
     Parameters
     ----------
@@ -25,12 +27,14 @@ def finite_array(values: Any, shape: tuple[int | None, ...] | None = None) -> Fl
         Anything.
     shape
         Lengths of the axes, None for an axis of any length; without a shape, any is accepted.
+    new
+        Whether it is a copy, which changes of ``values`` do not reach.
     """
     try:
         given = np.asarray(values)
         if given.dtype.kind == "c":  # NumPy drops imaginary parts with no more than a warning
             return None
-        array: FloatArray = given.astype(float)
+        array: FloatArray = given.astype(float, copy=new)
     except Exception:  # objects may raise anything
         return None
     fits = shape is None or (

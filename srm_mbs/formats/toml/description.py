@@ -33,7 +33,7 @@ from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure
 from srm_mbs.model.drives import Drive
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement
-from srm_mbs.model.laws import LAW_TYPES, Law, Polynomial, Table
+from srm_mbs.model.laws import LAW_TYPES, Law, Polynomial, Samples, Table
 from srm_mbs.model.reach import Reach
 
 Element = TypeVar("Element")
@@ -246,7 +246,8 @@ def _law(entry: Mapping[str, Any], tables: CsvFolder) -> Law:
 def _table_law(keys: Mapping[str, Any], tables: CsvFolder) -> Table:
     """The law of the columns, by default t and value, of a table in a CSV file."""
     names = (keys.get("time") or "t", keys.get("value") or "value")
-    return Table(*tables.table(keys["table"]).columns(names).T)
+    # Nothing changes the numbers of a table: laws share them.
+    return Table(*map(Samples, tables.table(keys["table"]).columns(names).T))
 
 
 def _refuse_columns(given: Mapping[str, Any]) -> None:
@@ -292,7 +293,7 @@ def _wrench_laws(file: str, time: str | None, tables: CsvFolder) -> tuple[Law, .
             file=table.file,
             remedy="Name the columns of force and moment in the first line",
         )
-    t, *columns = table.columns((time or "t", *there)).T
+    t, *columns = map(Samples, table.columns((time or "t", *there)).T)
     laws: dict[str, Law] = {name: Table(t, column) for name, column in zip(there, columns)}
     return tuple(laws.get(name, Polynomial([0.0])) for name in COMPONENTS)
 

@@ -276,8 +276,12 @@ double Run::late_past_layers(const StepResult& r) const {
         const double speed = system.friction_tolerance(i, 0.0);
         if (!std::isfinite(speed)) continue;
         const double scale = std::max(memory.state_scale[nv + i], r.state_scale[nv + i]);
-        late = std::max(late, late_past_layer(r.h, memory.rate[i], r.end_rate[i], speed,
-                                              step.norm.weight(nv + i, scale), constants()));
+        std::pair<double, double> stages(inf, -inf);
+        for (std::size_t at = i; at + 2 * nv < r.rates.size(); at += 2 * nv)
+            stages = {std::min(stages.first, r.rates[at]), std::max(stages.second, r.rates[at])};
+        late = std::max(late,
+                        late_past_layer(r.h, memory.rate[i], r.end_rate[i], stages, speed,
+                                        step.norm.weight(nv + i, scale), constants()));
     }
     return late;
 }

@@ -236,6 +236,7 @@ class Mechanics(Manifold):
         self._controller = controller
         self._damping: FloatArray = self.model.damping.copy()
         self._friction: FloatArray = self.model.friction.copy()
+        self._is_damped, self._has_friction = bool(self._damping.any()), bool(self._friction.any())
         self._friction_speed = mechanism.friction_speed
         self._forces = resolved_forces(mechanism)
         self._first, self._last = -np.inf, np.inf
@@ -333,11 +334,11 @@ class Mechanics(Manifold):
 
     def damping_force(self, v: FloatArray) -> FloatArray:
         """Joint damping -d v, for the rates v (nv,) or (n, nv)."""
-        return -self._damping * v if self._damping.any() else np.zeros(v.shape)
+        return -self._damping * v if self._is_damped else np.zeros(v.shape)
 
     def friction_force(self, v: FloatArray) -> FloatArray:
         """Joint friction -F tanh(v / v_s), for the rates v (nv,) or (n, nv)."""
-        if not self._friction.any():
+        if not self._has_friction:
             return np.zeros(v.shape)
         return -self._friction * np.tanh(v / self._friction_speed)
 
@@ -380,7 +381,8 @@ class Mechanics(Manifold):
     def _passive_force(self, v: FloatArray) -> FloatArray:
         """Damping and friction, or what acts in place of the laws of the coordinates."""
         if self._applied is None:
-            return self.damping_force(v) + self.friction_force(v)
+            damping = self.damping_force(v)
+            return damping + self.friction_force(v) if self._has_friction else damping
         if self._joined is not None:
             return self._applied
         force = np.zeros(self.nv)
@@ -400,7 +402,8 @@ class Mechanics(Manifold):
 
     def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Controller, joint damping and joint friction (nv,)."""
-        return self.controlled_force(t, q, v) + self._passive_force(v)
+        force = self._passive_force(v)
+        return force if self._controller is None else self.controlled_force(t, q, v) + force
 
     def _forces_at(self, t: float, state: FloatArray) -> FloatArray:
         """All forces (nv,) but those of inertia, gravity and closures."""
@@ -453,8 +456,8 @@ class Mechanics(Manifold):
         return {
             "unit": self._unit,
             "gap_scale": np.zeros(0),
-            "damping": self._damping if self._damping.any() else None,
-            "friction": self._friction if self._friction.any() else None,
+            "damping": self._damping if self._is_damped else None,
+            "friction": self._friction if self._has_friction else None,
         }
 
     def constants_of_model(self) -> dict[str, Any]:

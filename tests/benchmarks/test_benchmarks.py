@@ -373,6 +373,7 @@ def test_the_command_needs_a_checkout(tmp_path: Path, monkeypatch: pytest.Monkey
     assert "--peers" in run("benchmark", "--help")
 
 
+@pytest.mark.stress
 def test_the_command_measures_from_a_checkout(tmp_path: Path) -> None:
     arguments = ["--out", str(tmp_path), "--thin", "--repeats", "1", "--sections", "work"]
     chosen = ["--problems", "pendulum_chain", "--peers", "ours", "pinocchio_dop853"]

@@ -22,7 +22,7 @@ from tests.stress.urdf_mutations import UrdfMutator
 pytestmark = pytest.mark.stress
 
 COUNT = 1000
-ON_THE_COMMAND_LINE = 50
+ON_THE_COMMAND_LINE = 20
 PARTS = (TREE, LOOPS, START, DEFAULTS, NAMES)
 
 

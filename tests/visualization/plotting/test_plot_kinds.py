@@ -83,7 +83,17 @@ def note(figure: Figure) -> str:
 # -- all kinds --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", srm.bundled_models())
+DRAWN = {"slider_crank", "delta_robot", "differential", "klann_walker"}
+"""Of one loop in a plane, of drives, of joint closures, of many loops and points."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in DRAWN else [pytest.mark.stress])
+        for name in srm.bundled_models()
+    ],
+)
 def test_every_kind_of_every_bundled_mechanism_is_drawn_without_warnings(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

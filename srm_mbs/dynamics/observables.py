@@ -101,6 +101,16 @@ class Observables:
         ``values`` has the places of their entries."""
         return values(geometry.separated_rows(self.jacobians(t, q)), k)
 
+    def differences(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """Motions and changes of the rates (n, 2 nv) from the states a (n, nx) to b (n, nx)."""
+        model = self.mechanism.model
+        nq = model.nq
+        if nq == model.nv:
+            return b - a
+        moved = [pin.difference(model, *pair) for pair in zip(a[:, :nq], b[:, :nq])]
+        rates = b[:, nq:] - a[:, nq:]
+        return np.hstack([np.array(moved).reshape(len(a), model.nv), rates])
+
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         """Kinetic and potential energy (n, 2) J: of the bodies; of gravity, springs and
         bushings."""

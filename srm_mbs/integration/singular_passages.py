@@ -43,6 +43,8 @@ from srm_mbs.integration.dense_output import CRITICAL, STEP_PLACEMENTS, DenseOut
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.mechanism import MechanismData, per_model
 
+SAME_STAGE = 1e-9
+"""Distance of two stages, over the step, below which they are at the same time."""
 SLOPE_MARGIN = 1.5
 """Largest change of sigma per time between two stages, over the largest that was recorded around
 them."""
@@ -368,6 +370,16 @@ class Crossing:
 def _recorded(scheme: ButcherTableau, steps: StepData) -> tuple[FloatArray, FloatArray]:
     """Times and sigmas of the stages in order of time, each time once."""
     h = np.diff(steps.times)
+    if not np.logical_or.reduce(steps.stiff):  # stages in the same order in all steps
+        c = scheme.member(False).abscissae[1:]
+        along = np.argsort(c, kind="stable")
+        along = along[np.diff(c[along], prepend=0.0) > SAME_STAGE]
+        t = steps.times[:-1, None] + c[along] * h[:, None]
+        sigma = steps.sigmas[:, 1 + along]
+        return (
+            np.concatenate([steps.times[:1], t.ravel()]),
+            np.concatenate([steps.sigmas[0, :1], sigma.ravel()]),
+        )
     stages = steps.stage_times(scheme)[:, 1:]
     order = np.argsort(stages, axis=1, kind="stable")
     t = np.take_along_axis(stages, order, axis=1).ravel()
@@ -376,7 +388,7 @@ def _recorded(scheme: ButcherTableau, steps: StepData) -> tuple[FloatArray, Floa
     t = np.concatenate([steps.times[:1], t])
     sigma = np.concatenate([steps.sigmas[0, :1], sigma])
     step_of = np.concatenate([[0], step_of])
-    fresh = np.concatenate([[True], np.diff(t) > 1e-9 * h[step_of[1:]]])
+    fresh = np.concatenate([[True], np.diff(t) > SAME_STAGE * h[step_of[1:]]])
     return t[fresh], sigma[fresh]
 
 

@@ -439,6 +439,25 @@ class SimulationResult(RunOutcome):
             status=self.status,
         )
         run.request, run.error = self.request, self.error
+        run.observables = self.observables  # and their workspace
+        return run
+
+    def between_ends(self, t: FloatArray, allowed: FloatArray) -> Self:
+        """The run read at the times ``t`` (k,) s, ascending, as by :meth:`at`, but to within
+        ``allowed`` (2 nv,) only: most states then need no evaluation."""
+        run = type(self)(
+            self.mechanism,
+            self._system,
+            self.scheme,
+            self._whole,
+            t_eval=None,
+            events=self._events,
+            status=self.status,
+        )
+        run.t_eval = np.clip(t, self.steps.times[0], self.steps.end)
+        run._nodes = run.t_eval, self._dense.between_ends(run.t_eval, allowed)
+        run.request, run.error = self.request, self.error
+        run.observables = self.observables  # and their workspace
         return run
 
     @property

@@ -49,7 +49,12 @@ class SegmentedResult(SimulationResult):
         first = self.segments[0]
         self.mechanism = first.mechanism
         self.scheme = first.scheme
-        stiff = tuple(times for part in self.segments for times in part.settings.stiff)
+        stiff = tuple(
+            times
+            for part in self.segments
+            if part.steps.stiff.any()
+            for times in part.settings.stiff
+        )
         self.settings = replace(first.settings, stiff=stiff)
         self.status, self.message = RunStatus(status), message
         self.attempts = np.concatenate([segment.attempts for segment in self.segments])
@@ -113,6 +118,10 @@ class SegmentedResult(SimulationResult):
         )
         run.request, run.error = self.request, self.error
         return run
+
+    def between_ends(self, t: FloatArray, allowed: FloatArray) -> Self:
+        """As :meth:`at`: segments are short."""
+        return self.at(t)
 
     @property
     def span(self) -> tuple[float, float]:

@@ -394,7 +394,7 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
     parts: list[R] = []
     t = options.t0
     span = t_end - t
-    status, message = RunStatus.RUNNING, ""
+    status, message = RunStatus.RUNNING, ""  # without a message: that of the last segment
     failure: Exception | None = None
     at_once: list[Occurrence] = []
     try:
@@ -411,7 +411,7 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
             part = run_segment(mechanism, asked, types.plain, parts[-1] if parts else None)
             part.request = asked.repeatable()
             parts.append(part)
-            status, message, t = part.status, part.message, part.steps.end
+            status, t = part.status, part.steps.end
             due = []
             for event, times in zip(events, part.t_events or []):
                 event.count += len(times)
@@ -446,6 +446,7 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
             if parts and at_once:
                 parts[-1].add_occurrences(at_once)
                 at_once.clear()
+    message = message or parts[-1].message
     if len(parts) > 1:
         message += f" Event actions divide the run into {len(parts)} segments."
     result = types.segmented(parts, t_eval=options.t_eval, status=status, message=message)
@@ -548,6 +549,8 @@ def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
     A projection would then gain nothing, and next to a singular configuration it would move ``x``
     off its branch by rounding over sigma.
     """
+    if not system.has_constraints:
+        return True
     g, c = system.residuals(x, t)
     speed = 1.0 + float(np.abs(x[system.nq :]).max())
     return bool((np.abs(g) < CLOSED_ROUNDING).all() and (np.abs(c) < CLOSED_ROUNDING * speed).all())

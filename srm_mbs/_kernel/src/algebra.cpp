@@ -48,7 +48,10 @@ double Algebra::weakest() {
             eigen.computeFromTridiagonal(d, e);
             found = eigen.eigenvalues()[k];
             const double residual = length * std::abs(eigen.eigenvectors()(k, k));
-            if (last || !(residual > std::numeric_limits<double>::epsilon() * found)) break;
+            // B. N. Parlett, The Symmetric Eigenvalue Problem, SIAM 1998, 11.7.
+            const double gap = k > 0 ? found - eigen.eigenvalues()[k - 1] : 0.0;
+            const double error = gap > residual ? residual * residual / gap : residual;
+            if (last || !(error > std::numeric_limits<double>::epsilon() * found)) break;
         }
         beside.push_back(length);
     }

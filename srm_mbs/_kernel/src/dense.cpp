@@ -19,6 +19,8 @@ void Extension::check() const {
 void DenseConstants::check() const {
     expect_size("nodes", nodes.size(), 3);
     expect_within("nodes", nodes, 2, std::numeric_limits<int>::max());
+    if (!std::is_sorted(nodes.begin(), nodes.end()))
+        throw std::invalid_argument("nodes do not ascend");
 }
 
 DenseOutput::DenseOutput(int nq, int nv, const std::vector<SchemeDense>& schemes,
@@ -57,17 +59,24 @@ DenseOutput::DenseOutput(int nq, int nv, const std::vector<SchemeDense>& schemes
     }
 }
 
+long DenseOutput::step_at(double t) const {
+    const double* times = steps_.times;
+    const double slack = constants_.slack * std::max(std::abs(times[0]), std::abs(steps_.end));
+    if (!(t >= times[0] - slack && t <= steps_.end + slack))
+        throw std::out_of_range("outside the run");
+    const long found = std::upper_bound(times, times + steps_.count + 1, t) - times - 1;
+    return std::clamp(found, 0L, steps_.count - 1);
+}
+
 void DenseOutput::states(System& system, const double* t, long k, double* out) {
     const double* times = steps_.times;
-    const long count = steps_.count;
-    const double slack = constants_.slack * std::max(std::abs(times[0]), std::abs(steps_.end));
-    for (long i = 0; i < k; ++i)
-        if (!(t[i] >= times[0] - slack && t[i] <= steps_.end + slack))
-            throw std::out_of_range("outside the run");
     for (long i = 0; i < k; ++i, out += nx_) {
-        const long found = std::upper_bound(times, times + count + 1, t[i]) - times - 1;
-        const long step = std::clamp(found, 0L, count - 1);
+        const long step = step_at(t[i]);
         const double theta = (t[i] - times[step]) / (times[step + 1] - times[step]);
+        if (theta == 0.0 || theta == 1.0) {
+            std::copy_n(steps_.states + (step + (theta == 1.0)) * nx_, nx_, out);
+            continue;
+        }
         if (places_[step] == Place::unknown)
             places_[step] = close_to_singular(step) ? Place::near_singular : Place::regular;
         if (places_[step] == Place::regular) {

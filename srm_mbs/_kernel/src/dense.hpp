@@ -67,8 +67,22 @@ public:
     // States (k, nx) at the times t (k,); `system` is any workspace of the mechanism.  Throws
     // std::out_of_range for times outside the run.
     void states(System& system, const double* t, long k, double* out);
+    // The same by polynomials through ends of steps, without an evaluation, where two of them agree
+    // within `allowed` (n,).
+    void between_ends(System& system, const double* t, long k, const double* allowed, double* out);
 
 private:
+    // Ends around a step: fractions of the step, places and rates there in its chart, and those
+    // nearest to it.
+    struct EndNodes {
+        long step = -1;
+        std::vector<double> points, places, rates;
+        std::vector<int> nearest;
+    };
+    long step_at(double t) const;
+    void take_ends(System& system, long step, EndNodes& ends) const;
+    bool through_ends(System& system, const EndNodes& ends, double theta, const double* allowed,
+                      double* out);
     struct Polynomial {
         std::vector<double> points, coefficients;  // (k,), (k, n): Newton form
         bool in_layer = false;  // a polynomial in the variable of the layer

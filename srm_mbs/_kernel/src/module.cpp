@@ -352,6 +352,19 @@ struct PySystem {
         return owned_array(std::move(out));
     }
 
+    // Motions (n, 2 nv) from one to another of each two states (n, nx), in the chart of the first.
+    nb::object differences(const Array& from, const Array& to) {
+        const std::size_t nx = state_size(), n = from.size() / nx;
+        if (from.ndim() != 2 || from.shape(1) != nx || to.size() != from.size())
+            throw nb::value_error("states has another shape");
+        const auto width = 2 * static_cast<std::size_t>(system->nv);
+        std::vector<double> out(n * width), none(system->nv, 0.0);
+        for (std::size_t i = 0; i < n; ++i)
+            system->difference(from.data() + i * nx, to.data() + i * nx, none.data(),
+                               out.data() + i * width);
+        return owned_array(std::move(out), {n, width});
+    }
+
     // Kinetic and potential energy (n, 2).
     nb::object energies(const Array& states) {
         const std::size_t nx = state_size();
@@ -458,6 +471,7 @@ void bind_system(nb::module_& m) {
              nb::arg("states"))
         .def("accelerations", &PySystem::accelerations, nb::arg("t"), nb::arg("states"))
         .def("smallest_values", &PySystem::smallest_values)
+        .def("differences", &PySystem::differences, nb::arg("from"), nb::arg("to"))
         .def("energies", &PySystem::energies)
         .def("powers", &PySystem::powers, nb::arg("t"), nb::arg("states"), nb::arg("elements"),
              nb::arg("resting"))
@@ -977,6 +991,14 @@ struct PyDense {
         dense.states(*owner.system, t.data(), static_cast<long>(k), out.data());
         return owned_array(std::move(out), {k, nx});
     }
+
+    nb::object between_ends(PySystem& owner, const Array& t, const Array& allowed) {
+        const std::size_t k = t.size();
+        const double* within = vector_of(allowed, 2 * owner.system->nv, "allowed");
+        std::vector<double> out(k * nx);
+        dense.between_ends(*owner.system, t.data(), static_cast<long>(k), within, out.data());
+        return owned_array(std::move(out), {k, nx});
+    }
 };
 
 void bind_dense_output(nb::module_& m) {
@@ -986,7 +1008,8 @@ void bind_dense_output(nb::module_& m) {
                       const PySteps&>(),
              nb::arg("nq"), nb::arg("nv"), nb::arg("schemes"), nb::arg("constants"),
              nb::arg("steps"))
-        .def("states", &PyDense::states);
+        .def("states", &PyDense::states)
+        .def("between_ends", &PyDense::between_ends);
 }
 
 }  // namespace

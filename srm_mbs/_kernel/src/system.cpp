@@ -1258,21 +1258,34 @@ void System::closure_errors(double t, const double* state, double* g, double* ra
     update_closures(state, false);
     update_drives(t, false);
     std::copy(g_.begin(), g_.end(), g);
-    for (int i = 0; i < data_.rows; ++i) rates[i] = dot(filled(i), state + nq, nv);
-    for (const DrivenRow& drive : data_.drives) rates[drive.row] -= pushed_[drive.row];
+    const double* const v = state + nq;
+    const auto rate = [&](int row, const std::vector<int>& columns) {
+        const double* const G = filled(row);
+        rates[row] = 0.0;
+        for (const int j : columns) rates[row] += G[j] * v[j];
+    };
+    for (const ClosureRows& closure : data_.closures)
+        for (std::size_t k = 0; k < closure.count(); ++k)
+            rate(closure.first_row + static_cast<int>(k), closure.columns);
+    for (const JointRow& joints : data_.joint_rows) rate(joints.row, joints.in_v);
+    for (const Elimination& e : data_.eliminations) rate(e.row, e.columns);
+    for (const DrivenRow& drive : data_.drives) {
+        if (drive.in_v >= 0) rate(drive.row, {drive.in_v});
+        rates[drive.row] -= pushed_[drive.row];
+    }
 }
 
 std::array<double, 2> System::energies(const double* state) {
     auto& w = *work_;
-    std::copy(state, state + nq, w.q.data());
-    pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
-    mass_times(state + nq, v_.data());
-    double potential = potential_energy(data_.forces, w, state);
+    move_bodies(state);
+    double kinetic = 0.0, potential = potential_energy(data_.forces, w, state);
     for (int i = 1; i < w.model.njoints; ++i) {
         const auto& body = w.model.inertias[i];
+        kinetic += 0.5 * body.vtiv(w.data.v[i]);
         potential -= body.mass() * w.model.gravity.linear().dot(w.data.oMi[i].act(body.lever()));
     }
-    return {0.5 * dot(state + nq, v_.data(), nv), potential};
+    for (int i = 0; i < nv; ++i) kinetic += 0.5 * w.model.armature[i] * w.v[i] * w.v[i];
+    return {kinetic, potential};
 }
 
 void System::powers(double t, const double* state, const std::vector<ForceElement>& elements,

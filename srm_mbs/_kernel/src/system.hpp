@@ -221,6 +221,8 @@ public:
     // `elements`, each by itself, at the rates of the state or, if it is `resting`, those of its
     // force at rest.
     void closure_errors(double t, const double* state, double* g, double* rates);
+    // Whether joints have angles of which only cosine and sine are known.
+    bool wraps() const { return !data_.wrapped_angles.empty(); }
     std::array<double, 2> energies(const double* state);
     void powers(double t, const double* state, const std::vector<ForceElement>& elements,
                 bool resting, double* out);

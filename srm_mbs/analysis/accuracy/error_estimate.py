@@ -8,18 +8,17 @@ with the order of the scheme.  Errors that all runs share are not observed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
-from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import angle_coordinates
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.psrm import PSRM
+from srm_mbs.model.mechanism import MechanismData, per_model
 from srm_mbs.simulation.options import positive, tightest_rtol
 from srm_mbs.simulation.rerun import rerun
 from srm_mbs.simulation.result import SimulationResult
@@ -28,6 +27,10 @@ MAX_STEP_ENDS = 2000
 """Most ends of steps at which two runs are compared."""
 EVEN_TIMES = 501
 """Number of evenly spaced times at which they are compared as well, by dense output."""
+FEWEST_EVEN_TIMES = 25
+"""Fewest of them where each costs further stages; up to a fifth of the steps is read then."""
+READING_ERROR = 0.1
+"""Largest error of reading a rerun between its steps, over the tolerance of the one before it."""
 JUMP_MARGIN = 1e-9
 """Part of the run on either side of a jump of the state that is left out."""
 TIGHTEST_RATIO = 1e-2
@@ -243,11 +246,13 @@ def estimate_error(
     bound = tightest is solution
     partner = runs[-2][1] if bound else tightest
     times = sample_times(solution)
-    whole = compare(solution, partner, times)
+    looser = [setting for setting, _ in runs[:-1]]
+    readings = Readings(solution, None if fixed else READING_ERROR * min(looser))
+    whole = compare(solution, partner, times, readings)
     apart = whole.until(DISAGREEMENT)
     kept = whole
     if apart is not None:
-        kept = compare(solution, partner, times[times < apart])
+        kept = compare(solution, partner, times[times < apart], readings)
     # A scheme has its order at the ends of steps only; the coarsest grid is a subset of the others.
     grid = sample_times(runs[0][1], fixed=True) if fixed else times
     grid = grid if apart is None else grid[grid < apart]
@@ -255,7 +260,7 @@ def estimate_error(
         # Adaptive runs were compared with their partner on this grid already.
         kept.largest
         if {id(run), id(tightest)} == {id(solution), id(partner)} and not fixed
-        else compare(run, tightest, grid).largest
+        else compare(run, tightest, grid, readings).largest
         for _, run in runs[:-1]
     ]
     order = observed_order([setting for setting, _ in runs], differences)
@@ -355,11 +360,52 @@ def sample_times(solution: SimulationResult, *, fixed: bool = False) -> FloatArr
 
 
 def even_times(solution: SimulationResult) -> FloatArray:
-    """EVEN_TIMES evenly spaced times (s) from start to end."""
-    return np.linspace(*solution.span, EVEN_TIMES)
+    """Evenly spaced times (s) from start to end: EVEN_TIMES, or fewer where dense output takes
+    further stages in each step that it is read in."""
+    count = EVEN_TIMES
+    if len(solution.scheme.dense.extra_c):
+        count = min(count, max(FEWEST_EVEN_TIMES, solution.steps.count // 5))
+    return np.linspace(*solution.span, count)
 
 
-def compare(run: SimulationResult, other: SimulationResult, times: FloatArray) -> Comparison:
+class Readings:
+    """Runs read at times of comparison: ``solution`` by its dense output, and its reruns within a
+    part of the tolerance, each once.
+
+    Parameters
+    ----------
+    solution
+        The run whose error is estimated.
+    allowed
+        Largest error of reading a rerun, in units; None to read all by dense output.
+    """
+
+    def __init__(self, solution: SimulationResult, allowed: float | None = None) -> None:
+        self._solution = solution
+        units = solution.mechanism.structure.units
+        self._allowed = None
+        if allowed is not None:
+            self._allowed = allowed * np.concatenate(
+                [units.coordinate, units.coordinate * units.rate]
+            )
+        self._known: dict[tuple[int, bytes], SimulationResult] = {}
+
+    def __call__(self, run: SimulationResult, times: FloatArray) -> SimulationResult:
+        key = id(run), times.tobytes()
+        found = self._known.get(key)
+        if found is None:
+            allowed = None if run is self._solution else self._allowed
+            found = run.at(times) if allowed is None else run.between_ends(times, allowed)
+            self._known[key] = found
+        return found
+
+
+def compare(
+    run: SimulationResult,
+    other: SimulationResult,
+    times: FloatArray,
+    readings: Readings | None = None,
+) -> Comparison:
     """Compare two runs at those of ``times`` (n,) s that both cover.
 
     Windows around jumps of the state, whose times differ, are left out.
@@ -368,13 +414,15 @@ def compare(run: SimulationResult, other: SimulationResult, times: FloatArray) -
     times = times[times <= end]
     allowed, jumps = _between_jumps(run, other, times)
     times = times[allowed]
-    mechanism, model = run.mechanism, run.mechanism.model
-    a, b = run.at(times), other.at(times)
-    apart = _differences(model, a.q, b.q)
-    moved = _differences(model, np.repeat(a.q[:1], len(times), axis=0), a.q)
-    rates = b.v - a.v
+    mechanism, nv = run.mechanism, run.mechanism.model.nv
+    read = readings or Readings(run)
+    a, b = read(run, times), read(other, times)
+    states = np.hstack([a.q, a.v])
+    differences = run.segments[0].observables.differences
+    apart, rates = np.split(differences(states, np.hstack([b.q, b.v])), [nv], axis=1)
+    moved = differences(np.repeat(states[:1], len(times), axis=0), states)[:, :nv]
     units = mechanism.structure.units
-    for name in mechanism.joint_names:
+    for name in mechanism.joint_names if mechanism.model.nq > nv else ():
         joint = mechanism.joint(name)
         if joint.nv == 1 and joint.nq > 1:  # angle unwrapped
             angle, _ = a.joint(name)
@@ -386,13 +434,12 @@ def compare(run: SimulationResult, other: SimulationResult, times: FloatArray) -
             np.abs(rates / (units.coordinate * units.rate)).max(axis=1, initial=0.0),
         ]
     )
-    parts = list(_parts(mechanism))
-    chosen = np.zeros((model.nv, len(parts)))
-    for k, (_, _, own) in enumerate(parts):
-        chosen[own, k] = 1.0
+    parts = _parts(mechanism)
+    order = np.concatenate([own for _, _, own in parts])
+    starts = np.cumsum([0, *(len(own) for _, _, own in parts[:-1])])
     # The norm over the coordinates of each part, at the time at which it is largest.
     largest = [
-        np.sqrt((x**2 @ chosen).max(axis=0, initial=0.0)).tolist()
+        np.sqrt(np.add.reduceat(x[:, order] ** 2, starts, axis=1).max(axis=0, initial=0.0)).tolist()
         for x in (apart, rates, moved, a.v)
     ]
     joints = tuple(
@@ -401,23 +448,18 @@ def compare(run: SimulationResult, other: SimulationResult, times: FloatArray) -
     return Comparison(times, size, joints, jumps)
 
 
-def _parts(mechanism: Mechanism) -> Iterator[tuple[str, str, IndexArray]]:
+@per_model
+def _parts(mechanism: MechanismData) -> list[tuple[str, str, IndexArray]]:
     """(joint, unit, velocity indices): the lengths and the angles of each joint."""
     turns = angle_coordinates(mechanism.model)
+    parts = []
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
         own = np.arange(joint.idx_v, joint.idx_v + joint.nv)
         for unit, chosen in (("m", own[~turns[own]]), ("rad", own[turns[own]])):
             if len(chosen):
-                yield name, unit, chosen
-
-
-def _differences(model: pin.Model, a: FloatArray, b: FloatArray) -> FloatArray:
-    """b less a in tangent coordinates (n, nv), for configurations (n, nq)."""
-    if model.nq == model.nv:
-        return b - a
-    rows = [pin.difference(model, *pair) for pair in zip(a, b)]
-    return np.array(rows).reshape(len(rows), model.nv)
+                parts.append((name, unit, chosen))
+    return parts
 
 
 def _jump_times(run: SimulationResult) -> Sequence[float]:

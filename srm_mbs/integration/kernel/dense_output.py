@@ -79,21 +79,37 @@ class CompiledDenseOutput(DenseOutput):
         if self._by_reference:
             return super().__call__(t)
         try:
-            if self.kernel_system is not None:
-                return self._states(self.kernel_system, t)
-            code = code_of_record(self._made_by, self._mechanism_system.mechanism)
-            with workspace(self._mechanism_system, code) as kernel_system:
-                return self._states(kernel_system, t)
+            return self._read(t)
         except ArithmeticError:
             return super().__call__(t)  # raises the error that says why
         except IndexError:
             self.check(t)  # raises
             raise
 
-    def _states(self, kernel_system: Any, t: FloatArray) -> FloatArray:
-        before = kernel_system.evaluations, kernel_system.factorisations
+    def between_ends(self, t: FloatArray, allowed: FloatArray) -> FloatArray:
+        """As the reference (:meth:`DenseOutput.between_ends`)."""
+        if self._by_reference:
+            return super().between_ends(t, allowed)
         try:
-            return self._compiled.states(kernel_system, np.ascontiguousarray(t, dtype=float))  # type: ignore[no-any-return]
+            return self._read(t, allowed)
+        except ArithmeticError:
+            return super().between_ends(t, allowed)  # raises the error that says why
+        except IndexError:
+            self.check(t)  # raises
+            raise
+
+    def _read(self, t: FloatArray, *allowed: FloatArray) -> FloatArray:
+        if self.kernel_system is not None:
+            return self._states(self.kernel_system, t, *allowed)
+        code = code_of_record(self._made_by, self._mechanism_system.mechanism)
+        with workspace(self._mechanism_system, code) as kernel_system:
+            return self._states(kernel_system, t, *allowed)
+
+    def _states(self, kernel_system: Any, t: FloatArray, *allowed: FloatArray) -> FloatArray:
+        before = kernel_system.evaluations, kernel_system.factorisations
+        read = self._compiled.between_ends if allowed else self._compiled.states
+        try:
+            return read(kernel_system, np.ascontiguousarray(t, dtype=float), *allowed)  # type: ignore[no-any-return]
         finally:
             self._mechanism_system.count(
                 kernel_system.evaluations - before[0], kernel_system.factorisations - before[1]

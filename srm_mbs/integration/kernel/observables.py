@@ -124,6 +124,12 @@ class CompiledObservables(Observables):
             found[others] = super().smallest_values(geometry, values, k, t[others], q[others])
         return found
 
+    def differences(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        if a.shape[1] == 2 * self.mechanism.model.nv:
+            return b - a
+        with self._all_rows() as kernel_system:
+            return kernel_system.differences(a, b)  # type: ignore[no-any-return]
+
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         with self._all_rows() as kernel_system:
             return kernel_system.energies(np.hstack([q, v]))  # type: ignore[no-any-return]

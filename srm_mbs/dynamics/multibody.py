@@ -42,6 +42,7 @@ from srm_mbs.dynamics.forces import (
     BushingStep,
     Evaluator,
     ForceKinematics,
+    friction_sums,
     resolved_forces,
 )
 from srm_mbs.dynamics.manifold import Manifold
@@ -237,7 +238,7 @@ class Mechanics(Manifold):
         self._damping: FloatArray = self.model.damping.copy()
         self._friction: FloatArray = self.model.friction.copy()
         self._is_damped, self._has_friction = bool(self._damping.any()), bool(self._friction.any())
-        self._friction_speed = mechanism.friction_speed
+        self.friction_speed = mechanism.friction_speed
         self._forces = resolved_forces(mechanism)
         self._first, self._last = -np.inf, np.inf
         self._bushings: dict[Evaluator, BushingStep] = {}
@@ -340,7 +341,12 @@ class Mechanics(Manifold):
         """Joint friction -F tanh(v / v_s), for the rates v (nv,) or (n, nv)."""
         if not self._has_friction:
             return np.zeros(v.shape)
-        return -self._friction * np.tanh(v / self._friction_speed)
+        return -self._friction * np.tanh(v / self.friction_speed)
+
+    @cached_property
+    def friction_sums(self) -> FloatArray:
+        """See :class:`~srm_mbs.dynamics.system.System`."""
+        return friction_sums(self.model, self._forces)
 
     @cached_property
     def _law_coordinates(self) -> IndexArray:
@@ -370,9 +376,13 @@ class Mechanics(Manifold):
 
     def friction_tolerance(self, v: FloatArray) -> FloatArray:
         """See :class:`~srm_mbs.dynamics.system.System`."""
-        own = self._friction_speed + FRICTION_PART * np.abs(v)
-        limits = np.where(self._friction != 0.0, own, np.inf)
-        return np.concatenate([np.full(self.nv, np.inf), limits])
+        limits = np.full(2 * self.nv, np.inf)
+        for row in self.friction_sums:
+            own = np.flatnonzero(row)
+            size = self.friction_speed + FRICTION_PART * abs(float(row @ v))
+            at = self.nv + own
+            limits[at] = np.minimum(limits[at], size / np.abs(row[own]))
+        return limits
 
     def apply_laws(self, values: FloatArray | None) -> None:
         """See :class:`~srm_mbs.dynamics.system.System`."""
@@ -474,7 +484,7 @@ class Mechanics(Manifold):
             "order": [],
             "pivot_share": PIVOT_SHARE,
             "pivot_window": PIVOT_WINDOW,
-            "friction_speed": float(self._friction_speed),
+            "friction_speed": float(self.friction_speed),
             "forces": [] if self._forces is None else self._forces.constants(),
             "coincident": COINCIDENT,
             "half_turn": np.array([HALF_TURN_ROUNDING, LOCATED_HALF_TURN]),

@@ -161,8 +161,10 @@ def _with_massless_ends(
     )
 
 
-def _friction_note(model: pin.Model, friction_speed: float) -> tuple[str, ...]:
-    if not model.friction.any():
+def _friction_note(
+    model: pin.Model, forces: tuple[ForceElement, ...], friction_speed: float
+) -> tuple[str, ...]:
+    if not model.friction.any() and not any(getattr(force, "friction", 0.0) for force in forces):
         return ()
     return (
         "joint friction F acts as F tanh(v/v_s) with v_s = "
@@ -239,14 +241,15 @@ def unassembled(
     csv = CsvFolder(Path(source.path).parent, source.reach) if tables else None
     friction_speed = description.friction_speed
     actuators, idle = description.named_actuators()
+    forces = (
+        *description.force_elements(csv),
+        *_compensation(reading, model, np.array(source.gravity)),
+    )
     mechanism = reading.kind(
         model,
         description.closures(),
         q0=start,
-        forces=(
-            *description.force_elements(csv),
-            *_compensation(reading, model, np.array(source.gravity)),
-        ),
+        forces=forces,
         drives=description.drives(csv) if csv else (),
         friction_speed=friction_speed,
         name=description.name or model.name,
@@ -257,7 +260,7 @@ def unassembled(
             *built.notes,
             *massless,
             *idle,
-            *_friction_note(model, friction_speed),
+            *_friction_note(model, forces, friction_speed),
         ),
         points=description.named_points(),
         actuators=actuators,

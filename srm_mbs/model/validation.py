@@ -71,13 +71,19 @@ def check_inertia(model: pin.Model, file: str | None = None) -> None:
 
 
 def massless_ends(model: pin.Model) -> list[int]:
-    """The joints that move neither mass nor inertia, from the root to the tips."""
+    """The joints that move neither mass, inertia nor armature of their own, from the root to the
+    tips."""
     moved = np.zeros((model.njoints, 2))
     for joint in range(model.njoints - 1, 0, -1):
         inertia = model.inertias[joint]
         moved[joint] += inertia.mass, np.trace(inertia.inertia)
         moved[model.parents[joint]] += moved[joint]
-    return [joint for joint in range(1, model.njoints) if not moved[joint].any()]
+    return [
+        joint
+        for joint in range(1, model.njoints)
+        if not moved[joint].any()
+        and not model.armature[model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]].all()
+    ]
 
 
 def undetermined_joint(

@@ -212,6 +212,16 @@ System::System(const void* model, SystemData data, Controller controller)
     prediction_.resize(nv);
     white_.resize(nv);
     acted_.resize(nv);
+    find_friction();
+}
+
+void System::find_friction() {
+    friction_sums_.clear();
+    for (std::size_t i = 0; i < data_.friction.size(); ++i)
+        if (data_.friction[i] != 0.0) friction_sums_.push_back({{static_cast<int>(i)}, {1.0}});
+    for (const ForceElement& e : data_.forces)
+        if (e.kind == ForceKind::coupling_spring && friction(e) != 0.0)
+            friction_sums_.push_back({e.columns, e.signs});
 }
 
 System::~System() = default;
@@ -404,6 +414,7 @@ void System::renew(std::vector<double> unit, std::vector<double> residual_scale,
     data_.residual_scale = std::move(residual_scale);
     data_.damping = std::move(damping);
     data_.friction = std::move(friction);
+    find_friction();
     track_laws(false);
     held_from_.clear();
     held_.clear();
@@ -528,10 +539,8 @@ void System::passive_forces() {
     }
 }
 
-double System::friction_tolerance(int i, double v) const {
-    if (data_.friction.empty() || data_.friction[i] == 0.0)
-        return std::numeric_limits<double>::infinity();
-    return data_.friction_speed + friction_part * std::abs(v);
+double System::friction_tolerance(double rate) const {
+    return data_.friction_speed + friction_part * std::abs(rate);
 }
 
 bool System::time_dependent() const {

@@ -279,9 +279,11 @@ public:
     void applied_forces(double t, const double* state, double* out);
     // Whether the laws, each of its own coordinate, are all that makes them depend on the state.
     bool separate_forces() const { return !controller_ && !on_several_; }
-    bool has_friction() const { return !data_.friction.empty(); }
-    // Error of the rate v of a coordinate from which its friction is another; infinite without.
-    double friction_tolerance(int i, double v) const;
+    // The rates on which friction acts, and the speed over which it changes its sign.
+    const std::vector<FrictionSum>& friction_sums() const { return friction_sums_; }
+    double friction_speed() const { return data_.friction_speed; }
+    // Error of a rate with friction, which is `rate`, from which the friction is another.
+    double friction_tolerance(double rate) const;
     // Whether rates may depend on time itself: held forces do not.
     bool time_dependent() const;
     const std::vector<GroupJoint>& groups() const { return data_.groups; }
@@ -335,6 +337,9 @@ private:
     // Of generated derivatives, column by column: residuals by (q, v, laws), rows and laws by (q, v),
     // laws of coordinates by their own.
     std::vector<double> turns_, multipliers_, Dr_, Dc_, Dl_, Dq_, Dv_;
+    void find_friction();
+
+    std::vector<FrictionSum> friction_sums_;
     ForceLaws laws_;
     // Elements with laws, and the others, where the laws are joined.
     std::vector<ForceElement> lawful_, lawless_;

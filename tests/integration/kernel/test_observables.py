@@ -31,6 +31,7 @@ ELEMENTS: dict[str, tuple[srm.ForceElement, ...]] = {
         srm.SpringDamper(LINK, GROUND, 30.0, 2.0, 0.2, "strut"),
         srm.SpringDamper(LINK, GROUND, 30.0, 0.0, 0.2, "without damping"),
         srm.SpringDamper(LINK, GROUND, 0.0, 3.0, 0.0, "damper"),
+        srm.SpringDamper(LINK, GROUND, 30.0, 1.0, 0.0, "rope", slack=0.3),
     ),
     "a bushing": (
         srm.Bushing(LINK, GROUND, (5.0, 6.0, 7.0, 1.0, 2.0, 3.0), (0.5,) * 6, "bushing"),
@@ -39,6 +40,9 @@ ELEMENTS: dict[str, tuple[srm.ForceElement, ...]] = {
         srm.TorsionSpring("crank", 4.0, 0.7, 0.3, name="torsion"),
         srm.LimitSpring("crank", 100.0, 3.0, lower=-0.4, upper=0.5, depth=0.3, name="limit"),
         srm.CouplingSpring(("crank", "coupler"), (1.0, -2.0), 6.0, 0.4, 0.1, name="coupling"),
+        srm.CouplingSpring(
+            ("crank", "coupler"), (0.5, 1.0), 6.0, 0.0, 0.1, "belt", slack=0.3, friction=0.2
+        ),
     ),
     "loads": (
         srm.JointTorque("crank", 2.0, name="torque"),

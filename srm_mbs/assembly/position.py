@@ -20,7 +20,8 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
-from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.compiled_rows import ClosureRows
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, loop_rows
 from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.constraints.row_algebra import min_norm_solution, smallest_singular_value
 from srm_mbs.dynamics.constraints.rows import support, world_jacobian
@@ -60,8 +61,41 @@ def _periodic_coordinates(mechanism: MechanismData) -> BoolArray:
     return periodic_coordinates(mechanism.model)
 
 
+@per_model
+def _compiled_rows(mechanism: MechanismData) -> ClosureRows:
+    return ClosureRows(mechanism.model, loop_rows(mechanism).copy_workspace())
+
+
 class ClosureProblem(ClosureGeometry):
-    """The closure equations of a mechanism, and the distance from the intended closed state."""
+    """The closure equations of a mechanism, and the distance from the intended closed state.
+
+    The rows that were evaluated last are kept: assembly asks several times for those of one
+    configuration."""
+
+    _latest: tuple[bytes, FloatArray, FloatArray, FloatArray] | None = None
+
+    def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As of every geometry, by the kernel where there is one; nothing may change the arrays."""
+        key = q.tobytes()
+        if self._latest is None or self._latest[0] != key:
+            g, G = _compiled_rows(self.mechanism).at(q)
+            found = g / self.row_unit, G / self.row_unit[:, None] * self.unit
+            for array in found:
+                array.setflags(write=False)
+            self._latest = key, q.copy(), *found
+        return self._latest[2:]
+
+    def mass(self) -> FloatArray:
+        """As of every geometry."""
+        if self._latest is not None:
+            pin.crba(self.model, self.data, self._latest[1], pin.Convention.WORLD)
+        return super().mass()
+
+    def _placed(self) -> pin.Data:
+        """Placements and Jacobian of the joints where the rows were evaluated last."""
+        if self._latest is not None:
+            pin.computeJointJacobians(self.model, self.data, self._latest[1])
+        return self.data
 
     @cached_property
     def _unambiguous(self) -> list[IndexArray]:
@@ -144,8 +178,9 @@ class ClosureProblem(ClosureGeometry):
             parts.append(G[rows])
             if len(loop.rows.matched):
                 _, (joint_b, in_b), moves = self._matching[loop.name]
-                into_b = (self.data.oMi[joint_b] * in_b).rotation.T
-                turn = into_b @ (world_jacobian(self.data)[3:] * moves * self.unit)
+                data = self._placed()
+                into_b = (data.oMi[joint_b] * in_b).rotation.T
+                turn = into_b @ (world_jacobian(data)[3:] * moves * self.unit)
                 parts += [-pin.skew(axis) @ turn for axis in self._axes_in_b(loop)]
         return np.concatenate(parts)
 
@@ -169,7 +204,8 @@ class ClosureProblem(ClosureGeometry):
 
     def _axes_in_b(self, loop: LoopClosure) -> FloatArray:
         """The matched axes of a in the frame of b (c, 3), where the rows were evaluated last."""
-        a, b = (self.data.oMi[joint] * inside for joint, inside in self._matching[loop.name][:2])
+        data = self._placed()
+        a, b = (data.oMi[joint] * inside for joint, inside in self._matching[loop.name][:2])
         out: FloatArray = loop.rows.matched @ (b.rotation.T @ a.rotation).T
         return out
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -56,7 +59,7 @@ class ClosureRows:
     """
 
     def __init__(self, model: pin.Model, rows: LoopKinematics) -> None:
-        self._model, self._rows, self._data = model, rows, workspace(model)
+        self._model, self._rows = model, rows
         self.g, self.G = rows.g, rows.G
         self._kernel: Any = None
         if core is None:
@@ -90,8 +93,12 @@ class ClosureRows:
         data = core.SystemData(**fields, **closure_structs(LoopKinematics.constants(rows)))
         self._kernel = core.System(model, data, None)
 
-    def evaluate(self, q: FloatArray) -> None:
-        """Evaluate g and G at the configuration q (nq,).
+    @cached_property
+    def _data(self) -> pin.Data:
+        return workspace(self._model)
+
+    def at(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """g and G at the configuration q (nq,).
 
         Raises
         ------
@@ -100,13 +107,15 @@ class ClosureRows:
         """
         if self._kernel is not None:
             try:
-                self.g, self.G = self._kernel.rows_at(0.0, np.ascontiguousarray(q))
+                return self._kernel.rows_at(0.0, np.ascontiguousarray(q))  # type: ignore[no-any-return]
             except ArithmeticError:
                 pass  # the reference raises the error that says why
-            else:
-                return
         self._rows.evaluate(self._model, self._data, q)
-        self.g, self.G = self._rows.g.copy(), self._rows.G.copy()
+        return self._rows.g.copy(), self._rows.G.copy()
+
+    def evaluate(self, q: FloatArray) -> None:
+        """Evaluate g and G as :meth:`at`."""
+        self.g, self.G = self.at(q)
 
     def close(
         self,
@@ -114,8 +123,7 @@ class ClosureRows:
         row_unit: FloatArray,
         units: FloatArray,
         q: FloatArray,
-        evaluations: int,
-        **ends: float,
+        limits: Limits,
     ) -> tuple[FloatArray, float] | None:
         """Newton's iteration from q (nq,) onto the first rows, as many as ``algebra`` has, in one
         call of the kernel; None without it, and where the rows cannot be evaluated.
@@ -124,9 +132,8 @@ class ClosureRows:
         ----------
         row_unit : (rows,), units : (nv,)
             Errors over their units; steps are the shortest in those of the coordinates.
-        evaluations, ends
-            As for :func:`~srm_mbs.dynamics.constraints.newton.newton`, not monotone:
-            ``tolerance``, ``rounding``; ``cut``, pivots over the longest row that are zero.
+        limits
+            Where the iteration ends.
 
         Returns
         -------
@@ -137,7 +144,93 @@ class ClosureRows:
             return None
         try:
             return self._kernel.close(  # type: ignore[no-any-return]
-                algebra.compiled, row_unit, units, np.ascontiguousarray(q), evaluations, **ends
+                algebra.compiled, row_unit, units, np.ascontiguousarray(q), limits.compiled()
+            )
+        except ArithmeticError:
+            return None
+
+    def sampler(
+        self, algebras: Sequence[RowAlgebra | CompiledAlgebra], limits: Limits, **scaled: Any
+    ) -> CompiledSampler | None:
+        """Walks by the kernel over the rows; None without it.
+
+        Parameters
+        ----------
+        algebras
+            Of all rows and of those of the loops in the mass metric, and of the latter in units.
+        scaled
+            The other fields of ``ScaledRows`` (manifold.hpp).
+        """
+        compiled = [each.compiled for each in algebras if isinstance(each, CompiledAlgebra)]
+        if self._kernel is None or len(compiled) < len(algebras):
+            return None
+        made: Any = core
+        scaled_rows = made.ScaledRows(closing=limits.compiled(), **scaled)
+        return CompiledSampler(self._kernel, (scaled_rows, *compiled))
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Where Newton's iteration onto closures ends, as for
+    :func:`~srm_mbs.dynamics.constraints.newton.newton`, not monotone.
+
+    Attributes
+    ----------
+    evaluations, tolerance, rounding
+        As there.
+    cut
+        Pivots below this part of the longest row are zero.
+    """
+
+    evaluations: int
+    tolerance: float
+    rounding: float
+    cut: float
+
+    def compiled(self) -> Any:
+        """The kernel's own."""
+        made: Any = core
+        return made.ClosingLimits(
+            evaluations=self.evaluations,
+            tolerance=self.tolerance,
+            rounding=self.rounding,
+            cut=self.cut,
+        )
+
+
+@dataclass(frozen=True)
+class CompiledSampler:
+    """Walks of the load-time analysis in one call of the kernel each, from
+    :meth:`ClosureRows.sampler`.  What they return is None where anything cannot be evaluated."""
+
+    kernel_system: Any
+    rows: tuple[Any, ...]
+
+    def walk(
+        self,
+        q: FloatArray,
+        sample_start: bool,
+        directions: FloatArray,
+        reaches: FloatArray,
+        first: FloatArray | None,
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
+        """See ``ScaledSampler::walk``: configurations (n, nq), pivots (n, k) of all rows and
+        (n, l) of those of the loops, and the largest norms (rows,) of rows."""
+        start = np.ascontiguousarray(q)
+        try:
+            return self.kernel_system.walk(  # type: ignore[no-any-return]
+                *self.rows, start, sample_start, directions, reaches, first
+            )
+        except ArithmeticError:
+            return None
+
+    def open_norms(
+        self, q: FloatArray, spreads: FloatArray
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """See ``ScaledSampler::open_norms``: sums (rows,) and (2,) over the spreads (n, nv)."""
+        try:
+            return self.kernel_system.open_norms(  # type: ignore[no-any-return]
+                *self.rows, np.ascontiguousarray(q), spreads
             )
         except ArithmeticError:
             return None

@@ -33,6 +33,9 @@ from srm_mbs.dynamics.scaling import constraint_units, coordinate_units, row_uni
 from srm_mbs.model.drives import in_order_of_rows, positions
 from srm_mbs.model.mechanism import MechanismData, per_model, per_start
 
+OPEN_SAMPLES = 8
+"""Random open configurations from which the usual norms of rows are measured."""
+
 
 class ClosureGeometry:
     """The closure equations of a mechanism, without its drives.
@@ -59,15 +62,30 @@ class ClosureGeometry:
     def __init__(self, mechanism: MechanismData, start: FloatArray) -> None:
         self.mechanism = mechanism
         self.start = start
-        # Gravity cancels in Gdot v, but its rounding would not at small rates.
-        self.model = mechanism.model.copy()
-        self.model.gravity.linear = np.zeros(3)
-        self.data = workspace(self.model)
-        self.rows = _loop_rows(mechanism).copy_workspace()
+        self.model = mechanism.model
         self.units = coordinate_units(mechanism, start, np.zeros(self.model.nv))
         self.unit = self.coordinate_unit = self.units.coordinate
         self.row_unit = row_units(mechanism, self.units)
         self.drives: tuple[str, ...] = ()
+
+    # Most starts are closed and regular by the kernel alone, which needs none of these.
+    @cached_property
+    def weightless(self) -> pin.Model:
+        """The model without gravity, which cancels in Gdot v, but whose rounding would not at small
+        rates."""
+        model = self.model.copy()
+        model.gravity.linear = np.zeros(3)
+        return model
+
+    @cached_property
+    def data(self) -> pin.Data:
+        """Pinocchio's workspace."""
+        return workspace(self.model)
+
+    @cached_property
+    def rows(self) -> LoopKinematics:
+        """The rows of the loops, unscaled."""
+        return loop_rows(self.mechanism).copy_workspace()
 
     def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """g over row units (rows,), and G over row units times coordinate units (rows, nv)."""
@@ -90,18 +108,20 @@ class ClosureGeometry:
         return _row_size_at_start(self.mechanism) if at_start else self._measured_row_size()
 
     def _measured_row_size(self) -> FloatArray:
-        rng = np.random.default_rng(0)
-        squares = np.zeros(len(self.row_unit))
-        uncancelled = np.zeros(2)
-        for _ in range(8):
-            spread = rng.uniform(-np.pi, np.pi, self.model.nv) * self.unit
-            _, G = self.closure(pin.integrate(self.model, self.start, spread))
-            squares += (G**2).sum(axis=1) / 8
-            # Norm of the rows if no terms in them cancelled: their rounding is eps times it.
-            J = world_jacobian(self.data)
-            turn = np.linalg.norm(J[3:], axis=0) * self.unit
-            shift = np.linalg.norm(J[:3], axis=0) * self.unit / self.units.length + turn
-            uncancelled += np.array([shift @ shift, turn @ turn]) / 8
+        rng, model = np.random.default_rng(0), self.model
+        spreads = rng.uniform(-np.pi, np.pi, (OPEN_SAMPLES, model.nv)) * self.coordinate_unit
+        G = np.empty((OPEN_SAMPLES, len(self.row_unit), model.nv))
+        J = np.empty((OPEN_SAMPLES, 6, model.nv))
+        for i, spread in enumerate(spreads):
+            q = pin.integrate(model, self.start, spread)
+            G[i] = self.closure(q)[1]
+            pin.computeJointJacobians(model, self.data, q)
+            J[i] = world_jacobian(self.data)
+        squares = (G * G).sum(axis=(0, 2)) / OPEN_SAMPLES
+        # Norm of the rows if no terms in them cancelled: their rounding is eps times it.
+        turn = np.linalg.norm(J[:, 3:], axis=1) * self.coordinate_unit
+        shift = np.linalg.norm(J[:, :3], axis=1) * self.coordinate_unit / self.units.length + turn
+        uncancelled = ((shift * shift).sum() / OPEN_SAMPLES, (turn * turn).sum() / OPEN_SAMPLES)
         at = 0
         for loop in self.mechanism.loops:
             own = squares[at : at + loop.rows.count]
@@ -177,7 +197,7 @@ class ClosureGeometry:
 
     def bias(self, q: FloatArray, u: FloatArray) -> FloatArray:
         """Gdot v, rows over their usual size, for the rates u (nv,) in units."""
-        self.rows.evaluate(self.model, self.data, q, u * self.unit)
+        self.rows.evaluate(self.weightless, self.data, q, u * self.unit)
         return self.rows.bias / self.row_unit / self.row_size
 
     def mass(self) -> FloatArray:
@@ -206,7 +226,7 @@ class ClosureGeometry:
 
 
 @per_model
-def _loop_rows(mechanism: MechanismData) -> LoopKinematics:
+def loop_rows(mechanism: MechanismData) -> LoopKinematics:
     """The rows of the loops, unscaled; geometries copy their workspace."""
     return LoopKinematics(mechanism.model, mechanism.loops)
 
@@ -237,7 +257,11 @@ class DriveRows:
     """
 
     def __init__(self, mechanism: MechanismData, geometry: ClosureGeometry, q: FloatArray) -> None:
-        self._model, self._data, self._q = geometry.model, geometry.data, q
+        self.rows, self.rates = np.zeros((0, geometry.model.nv)), np.zeros(0)
+        self._kinematics: DrivenKinematics | None = None
+        if not mechanism.drives:
+            return
+        self._geometry, self._q = geometry, q
         self._unit = geometry.unit
         self._kinematics = DrivenKinematics(geometry.model, (), mechanism.drives)
         units = constraint_units(mechanism, geometry.units)
@@ -249,12 +273,15 @@ class DriveRows:
         ).reshape(-1, 3)
         self.rates = moving[:, 1] / self._row_unit
         self._accelerations = moving[:, 2] / self._row_unit
-        self._kinematics.evaluate(self._model, self._data, q)
+        self._kinematics.evaluate(geometry.model, geometry.data, q)
         self.rows = self._kinematics.G / self._row_unit[:, None] * self._unit
 
     def bias(self, u: FloatArray) -> FloatArray:
         """Gdot v - s'' (k,) for the rates u (nv,) in units."""
-        self._kinematics.evaluate(self._model, self._data, self._q, u * self._unit)
+        if self._kinematics is None:
+            return self.rates
+        geometry = self._geometry
+        self._kinematics.evaluate(geometry.weightless, geometry.data, self._q, u * self._unit)
         return self._kinematics.bias / self._row_unit - self._accelerations
 
 
@@ -312,7 +339,7 @@ class DrivenGeometry(ClosureGeometry):
     def bias(self, place: FloatArray, u: FloatArray) -> FloatArray:
         """Gdot v - s'' (dt)^2, rows over their usual size, for the rates u = (v, dt) in units."""
         rows, rates = self._rows, u * self.unit
-        rows.evaluate(self.model, self.data, place[:-1], rates[:-1])
+        rows.evaluate(self.weightless, self.data, place[:-1], rates[:-1])
         of_motion = rows.bias.copy()
         rows.move_to(float(place[-1]))
         whole: FloatArray = of_motion + (rows.bias - of_motion) * rates[-1] ** 2

@@ -20,7 +20,7 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
-from srm_mbs.dynamics.constraints.compiled_rows import ClosureRows
+from srm_mbs.dynamics.constraints.compiled_rows import ClosureRows, compiled_rows
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, loop_rows
 from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.constraints.row_algebra import min_norm_solution, smallest_singular_value
@@ -62,7 +62,9 @@ def _periodic_coordinates(mechanism: MechanismData) -> BoolArray:
 
 
 @per_model
-def _compiled_rows(mechanism: MechanismData) -> ClosureRows:
+def _compiled_loop_rows(mechanism: MechanismData) -> ClosureRows:
+    if not mechanism.drives:
+        return compiled_rows(mechanism)
     return ClosureRows(mechanism.model, loop_rows(mechanism).copy_workspace())
 
 
@@ -78,7 +80,7 @@ class ClosureProblem(ClosureGeometry):
         """As of every geometry, by the kernel where there is one; nothing may change the arrays."""
         key = q.tobytes()
         if self._latest is None or self._latest[0] != key:
-            g, G = _compiled_rows(self.mechanism).at(q)
+            g, G = _compiled_loop_rows(self.mechanism).at(q)
             found = g / self.row_unit, G / self.row_unit[:, None] * self.unit
             for array in found:
                 array.setflags(write=False)
@@ -129,12 +131,10 @@ class ClosureProblem(ClosureGeometry):
         """Numbers of the loops, and velocity indices of the coordinates that move them, of the
         smallest groups of loops that share no coordinate: each closes by itself."""
         out: list[tuple[list[int], set[int]]] = []
+        pattern, row = loop_rows(self.mechanism).pattern(), 0
         for number, loop in enumerate(self.mechanism.loops):
-            if loop.joints is None:
-                (a, _), (b, _) = loop.resolve(self.model)
-                own = set(np.flatnonzero(support(self.model, a) != support(self.model, b)).tolist())
-            else:
-                own = {self.mechanism.joint(name).idx_v for name in loop.joints}
+            rows = pattern[row : row + loop.rows.count]
+            own, row = set(np.flatnonzero(rows.any(axis=0)).tolist()), row + loop.rows.count
             numbers = [number]
             for group in [group for group in out if group[1] & own]:
                 out.remove(group)

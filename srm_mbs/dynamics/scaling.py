@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 import pinocchio as pin
@@ -211,10 +212,10 @@ def _diagonal(mechanism: MechanismData, data: pin.Data) -> float:
     """:func:`scene_diagonal` at the placements of ``data``."""
     model = mechanism.model
     points = []
-    for joint in range(1, model.njoints):
-        points.append(data.oMi[joint].translation.copy())
-        if model.inertias[joint].mass > 0.0:
-            points.append(data.oMi[joint].act(model.inertias[joint].lever))
+    for place, body in zip(islice(data.oMi, 1, None), islice(model.inertias, 1, None)):
+        points.append(place.translation.copy())
+        if body.mass > 0.0:
+            points.append(place.act(body.lever))
     for joint, point in _anchors(mechanism):
         points.append(data.oMi[joint].act(point))
     corners = np.array(points) if points else np.zeros((1, 3))

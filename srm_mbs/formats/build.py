@@ -32,7 +32,8 @@ from srm_mbs.errors import (
 from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.plausibility import doubtful_angles, doubtful_inertias
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
-from srm_mbs.formats.urdf.parser import build_urdf, lock_joints
+from srm_mbs.formats.urdf.parser import UrdfModel, build_urdf, lock_joints
+from srm_mbs.formats.variants import Elements
 from srm_mbs.formats.xml import parse_xml
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.coordinates import write_position, write_rate
@@ -192,6 +193,10 @@ class Reading:
         Reads it again with other values of its parameters; None without parameters.
     analysis
         That of another variant of the description, if it is one.
+    shape, model
+        As of :class:`~srm_mbs.formats.translation.Translation`.
+    elements
+        Its elements, where they are not made from the tables of the description.
     """
 
     description: Description
@@ -203,6 +208,9 @@ class Reading:
     kind: type[Mechanism] = Mechanism
     variants: VariantMaker | None = None
     analysis: ReusableAnalysis | None = None
+    shape: tuple[Any, ...] = ()
+    model: pin.Model | None = None
+    elements: Elements | None = None
 
 
 def unassembled(
@@ -218,15 +226,19 @@ def unassembled(
         Naming file, element and remedy.
     """
     description, source = reading.description, reading.source
-    built = build_urdf(
-        reading.tree, source.urdf_path, source.base, description.lock, description.coupled_joints()
-    )
+    if reading.model is not None:
+        built = UrdfModel(reading.model, ())
+    else:
+        locked, coupled = description.lock, description.coupled_joints()
+        built = build_urdf(reading.tree, source.urdf_path, source.base, locked, coupled)
     built.model.gravity.linear = np.array(source.gravity)
     description, massless = _with_massless_ends(description, built.model)
     _check_joint_names(description, built.model)
     model, q, v, guess = _without_locked(description, built.model)
     check_inertia(model, source.urdf_path)
-    _check_frames(description, model)
+    elements = reading.elements
+    if elements is None:
+        _check_frames(description, model)
     start = pin.neutral(model)
     for where, values in (("initial.guess", guess), ("initial.q", q)):
         for name, value in values.items():
@@ -241,7 +253,7 @@ def unassembled(
     actuators, idle = description.named_actuators()
     mechanism = reading.kind(
         model,
-        description.closures(),
+        description.closures() if elements is None else elements.closures,
         q0=start,
         forces=(
             *description.force_elements(csv),
@@ -259,7 +271,7 @@ def unassembled(
             *idle,
             *_friction_note(model, friction_speed),
         ),
-        points=description.named_points(),
+        points=description.named_points() if elements is None else elements.points,
         actuators=actuators,
     )
     if description.limits == "spring":
@@ -425,7 +437,8 @@ def assembled(reading: Reading) -> Mechanism:
         As :func:`srm_mbs.load`.
     """
     description, source = reading.description, reading.source
-    description.refuse_identical_closures()
+    if reading.elements is None:
+        description.refuse_identical_closures()
     mechanism, q, v = unassembled(reading)
     try:
         if description.closing_tolerance:

@@ -249,8 +249,8 @@ struct PySystem {
         return nb::make_tuple(owned_array(std::move(at)), error);
     }
 
-    // ScaledSampler::walk() of as many steps as there are reaches; its samples.  No other thread has
-    // the system and the algebra.
+    // ScaledSampler::walk() of as many steps as there are reaches; its samples.  With the
+    // interpreter's lock held, so that threads may share the system.
     nb::tuple walk(const ScaledRows& rows, Algebra& all, Algebra& loops, Algebra& in_units,
                    const Array& q, bool sample_start, const Array& directions,
                    const Array& reaches, std::optional<Array> first) {
@@ -259,11 +259,8 @@ struct PySystem {
         const std::size_t steps = count_of(reaches, directions, system->nv);
         const double* along = first ? vector_of(*first, system->nv, "first") : nullptr;
         WalkSamples found;
-        {
-            const WithoutLock released;
-            sampler.walk(to_vector(q), sample_start, static_cast<int>(steps), directions.data(),
-                         reaches.data(), along, found);
-        }
+        sampler.walk(to_vector(q), sample_start, static_cast<int>(steps), directions.data(),
+                     reaches.data(), along, found);
         const std::size_t n = found.count;
         const auto each = [&](const Algebra& algebra) {
             return static_cast<std::size_t>(std::min(algebra.rows(), algebra.columns()));
@@ -284,11 +281,8 @@ struct PySystem {
         if (spreads.ndim() != 2 || spreads.shape(1) != nv)
             throw nb::value_error("spreads are not rows of nv numbers");
         std::vector<double> squares(system->rows()), uncancelled(2);
-        {
-            const WithoutLock released;
-            sampler.open_norms(to_vector(q), spreads.shape(0), spreads.data(), squares.data(),
-                               uncancelled.data());
-        }
+        sampler.open_norms(to_vector(q), spreads.shape(0), spreads.data(), squares.data(),
+                           uncancelled.data());
         return nb::make_tuple(owned_array(std::move(squares)), owned_array(std::move(uncancelled)));
     }
 

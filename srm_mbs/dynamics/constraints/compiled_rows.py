@@ -13,8 +13,10 @@ import pinocchio as pin
 from srm_mbs._kernel import core
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rheonomic import unscaled_rows
 from srm_mbs.dynamics.constraints.row_algebra import CompiledAlgebra, RowAlgebra
 from srm_mbs.dynamics.constraints.rows import COINCIDENT, LoopKinematics
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 _NO_NUMBERS = np.zeros(0)
 
@@ -167,6 +169,19 @@ class ClosureRows:
         made: Any = core
         scaled_rows = made.ScaledRows(closing=limits.compiled(), **scaled)
         return CompiledSampler(self._kernel, (scaled_rows, *compiled))
+
+
+@per_model
+def _shared_rows(mechanism: MechanismData) -> ClosureRows:
+    return ClosureRows(mechanism.model, unscaled_rows(mechanism).copy_workspace())
+
+
+def compiled_rows(mechanism: MechanismData) -> ClosureRows:
+    """All rows of a mechanism, unscaled and without the motions of its drives, for users of which
+    none keeps results in it."""
+    if core is not None:
+        return _shared_rows(mechanism)
+    return ClosureRows(mechanism.model, unscaled_rows(mechanism).copy_workspace())
 
 
 @dataclass(frozen=True)

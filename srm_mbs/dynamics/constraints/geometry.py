@@ -26,7 +26,7 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.projection import symmetric
-from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, all_rows
+from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, all_rows, unscaled_rows
 from srm_mbs.dynamics.constraints.rows import LoopKinematics, world_jacobian
 from srm_mbs.dynamics.constraints.structure import DEPENDENT, ROUNDING_ROW, structure_of
 from srm_mbs.dynamics.scaling import constraint_units, coordinate_units, row_units
@@ -107,7 +107,11 @@ class ClosureGeometry:
         at_start = self.start is self.mechanism.q0
         return _row_size_at_start(self.mechanism) if at_start else self._measured_row_size()
 
-    def _measured_row_size(self) -> FloatArray:
+    @cached_property
+    def _open_norms(self) -> tuple[FloatArray, tuple[float, float]]:
+        """Mean squares over open configurations of the norms of rows (rows,) and, if no terms in
+        rows cancelled, of one along a direction and of one of an alignment: their rounding is eps
+        times it."""
         rng, model = np.random.default_rng(0), self.model
         spreads = rng.uniform(-np.pi, np.pi, (OPEN_SAMPLES, model.nv)) * self.coordinate_unit
         G = np.empty((OPEN_SAMPLES, len(self.row_unit), model.nv))
@@ -117,12 +121,32 @@ class ClosureGeometry:
             G[i] = self.closure(q)[1]
             pin.computeJointJacobians(model, self.data, q)
             J[i] = world_jacobian(self.data)
-        squares = (G * G).sum(axis=(0, 2)) / OPEN_SAMPLES
-        # Norm of the rows if no terms in them cancelled: their rounding is eps times it.
         turn = np.linalg.norm(J[:, 3:], axis=1) * self.coordinate_unit
         shift = np.linalg.norm(J[:, :3], axis=1) * self.coordinate_unit / self.units.length + turn
-        uncancelled = ((shift * shift).sum() / OPEN_SAMPLES, (turn * turn).sum() / OPEN_SAMPLES)
+        squares = (G * G).sum(axis=(0, 2)) / OPEN_SAMPLES
+        return squares, (
+            float((shift * shift).sum()) / OPEN_SAMPLES,
+            float((turn * turn).sum()) / OPEN_SAMPLES,
+        )
+
+    @cached_property
+    def idle_rows(self) -> BoolArray:
+        """Which rows (rows,) are rounding in all open configurations: they are always satisfied, as
+        those out of the plane of a linkage."""
+        squares, (along, turning) = self._open_norms
+        whole = np.zeros(len(squares))
         at = 0
+        for loop in self.mechanism.loops:
+            lengths, turns, _ = loop.rows.blocks
+            whole[at : at + loop.rows.count][lengths] = along
+            whole[at : at + loop.rows.count][turns] = turning
+            at += loop.rows.count
+        idle: BoolArray = squares <= ROUNDING_ROW**2 * whole
+        return idle
+
+    def _measured_row_size(self) -> FloatArray:
+        squares, uncancelled = self._open_norms
+        squares, at = squares.copy(), 0
         for loop in self.mechanism.loops:
             own = squares[at : at + loop.rows.count]
             for block, whole in zip(loop.rows.blocks[:2], uncancelled):
@@ -228,6 +252,8 @@ class ClosureGeometry:
 @per_model
 def loop_rows(mechanism: MechanismData) -> LoopKinematics:
     """The rows of the loops, unscaled; geometries copy their workspace."""
+    if not mechanism.drives:
+        return unscaled_rows(mechanism)
     return LoopKinematics(mechanism.model, mechanism.loops)
 
 

@@ -12,13 +12,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
-from srm_mbs.dynamics.constraints.compiled_rows import ClosureRows, CompiledSampler, Limits
+from srm_mbs.dynamics.constraints.compiled_rows import CompiledSampler, Limits, compiled_rows
 from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.constraints.projection import (
     PIVOT_ZERO,
@@ -28,7 +29,7 @@ from srm_mbs.dynamics.constraints.projection import (
     unwhiten,
     whiten,
 )
-from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
+from srm_mbs.dynamics.constraints.rheonomic import unscaled_rows
 from srm_mbs.dynamics.constraints.row_algebra import RowAlgebra, row_algebra, trees
 from srm_mbs.dynamics.constraints.rows import Elimination, world_jacobian
 from srm_mbs.dynamics.scaling import Units, coordinate_units, row_units
@@ -106,11 +107,10 @@ class ManifoldSampler:
     def __init__(self, mechanism: MechanismData, units: Units) -> None:
         self._mechanism = mechanism
         self.model = mechanism.model
-        self.data = workspace(self.model)
         self.units = units
         self.row_unit = row_units(mechanism, units)
-        rows = DrivenKinematics(self.model, mechanism.loops, mechanism.drives)
-        self._rows = ClosureRows(self.model, rows)
+        rows = unscaled_rows(mechanism)
+        self._rows = compiled_rows(mechanism)
         self.closed = len(self.row_unit)
         # From G to rows over their unit, of coordinates over theirs.
         self._to_units = units.coordinate / self.row_unit[:, None]
@@ -127,11 +127,15 @@ class ManifoldSampler:
         self._trees = trees(self.model)
         self._factorised: FloatArray | None = None
 
+    @cached_property
+    def data(self) -> pin.Data:
+        """Pinocchio's workspace, of the reference."""
+        return workspace(self.model)
+
     def _scaled(self, q: FloatArray) -> FloatArray:
         """G (rows, nv) of the rows after the eliminations, over their scale; M at q in ``data``."""
         pin.crba(self.model, self.data, q, pin.Convention.WORLD)
-        self._rows.evaluate(q)
-        G = self._rows.G
+        _, G = self._rows.at(q)
         if self.eliminations:
             G = G.copy()
         for row, other, factor in self.eliminations:
@@ -161,11 +165,11 @@ class ManifoldSampler:
         against, own = -self.units.coordinate, slice(self.closed)
 
         def linearise(q: FloatArray) -> tuple[float, Callable[[], FloatArray | None]]:
-            self._rows.evaluate(q)
-            g = self._rows.g[own] / self.row_unit
+            g, G = self._rows.at(q)
+            g = g[own] / self.row_unit
 
             def step() -> FloatArray | None:
-                by_unit = self._rows.G[own] * self._to_units
+                by_unit = G[own] * self._to_units
                 try:
                     longest = math.sqrt(np.einsum("ij,ij->i", by_unit, by_unit).max())
                     self._in_units.factor(None, by_unit, CLOSING_RANK * longest)
@@ -365,8 +369,8 @@ class ManifoldSampler:
         *,
         sample_start: bool = False,
     ) -> Samples:
-        """Samples on ``restarts`` random walks of ``steps`` steps from ``start``, which is closed if
-        it is to be a sample, the first one.
+        """Samples on ``restarts`` random walks of ``steps`` steps from ``start``, which is closed
+        if it is to be a sample, the first one.
 
         The first steps of two of them go along the velocity ``first`` (nv,) and against it, unless
         it is zero.

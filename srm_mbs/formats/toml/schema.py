@@ -30,6 +30,8 @@ from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
 
 def _number(value: Any) -> float:
+    if type(value) is float and abs(value) <= LARGEST_MAGNITUDE:
+        return value
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise PydanticCustomError("number", "a finite number is wanted")
     if not abs(value) <= LARGEST_MAGNITUDE:

@@ -18,6 +18,7 @@ from srm_mbs.dynamics.constraints.structure import ManifoldSampler, Structure, a
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from tests.support.bundled import load
 from tests.support.mechanisms import (
+    DISTINCT_MODELS,
     add_link,
     along_x,
     floating_ring,
@@ -91,7 +92,7 @@ def same(a: Structure, b: Structure) -> bool:
 # --- bundled mechanisms -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", srm.bundled_models())
+@pytest.mark.parametrize("name", DISTINCT_MODELS)
 def test_rank_degrees_of_freedom_and_redundant_rows_are_known(name: str) -> None:
     mechanism = load(name)
     nv, rank, redundant = KNOWN[name]

@@ -33,6 +33,8 @@ from srm_mbs.model.mechanism import MechanismData, per_model
 
 CONSTRAINT_TOLERANCE = 1e-12
 """Largest closure error of an assembled state, in rad and in scene diagonals."""
+EXACTLY_CLOSED = 1e-15
+"""Closure error, in the same units, that is rounding: no step makes it smaller for certain."""
 AXES_TOLERANCE = 1e-2
 """Largest mismatch of an assembled state: larger ones have axes in the opposite sense."""
 RANK_TOLERANCE = 1e-10
@@ -86,6 +88,11 @@ class ClosureProblem(ClosureGeometry):
                 array.setflags(write=False)
             self._latest = key, q.copy(), *found
         return self._latest[2:]
+
+    def _jacobians(self, q: FloatArray) -> FloatArray:
+        G = _compiled_loop_rows(self.mechanism).jacobians(q)
+        out: FloatArray = G / self.row_unit[:, None] * self.unit
+        return out
 
     def mass(self) -> FloatArray:
         """As of every geometry."""
@@ -235,6 +242,8 @@ class ClosureProblem(ClosureGeometry):
 
     def unwrapped(self, q: FloatArray) -> FloatArray:
         """q with its periodic angles within half a turn of those at the start."""
+        if np.abs(q - self.start).max() < 0.5 * np.pi:  # of (cos, sin) pairs and quaternions, too
+            return q
         own = self._periodic[0]
         turns = np.round((q[own] - self.start[own]) / (2.0 * np.pi))
         q = q.copy()
@@ -348,7 +357,8 @@ def close_positions(
     ``bounds`` are the least and largest motions of these, in units.
     """
     if np.linalg.norm(problem.mismatch(q)) <= CONSTRAINT_TOLERANCE:
-        return problem.unwrapped(polish(problem, q, free))
+        exact = np.abs(problem.closure(q)[0]).max() <= EXACTLY_CLOSED
+        return problem.unwrapped(q if exact else polish(problem, q, free))
     for near in (True, False):  # without damping where no configuration near q is closed
         found = polish(problem, _search(problem, q, free, steps, bounds, near=near), free)
         if problem.closed(found):

@@ -347,18 +347,20 @@ ROTOR_INERTIA = 1e-9
 less than tolerances show, and enough for accelerations to be above rounding."""
 
 
-def _with_rotors(mechanism: Mechanism) -> Mechanism:
-    """The mechanism with rotors on damped joints that move no inertia at the start, and a note.
+def _with_rotors(mechanism: Mechanism) -> tuple[Mechanism, int | None]:
+    """The mechanism with rotors on damped joints that move no inertia at the start, and a note; and
+    a joint that moves none still, if there is one.
 
     Damping d alone determines the motion along such a direction, as for d -> 0 of the inertia.
     """
     model, source = mechanism.model, mechanism.source
     armature = np.array(model.armature)
+    path = None if source is None else source.urdf_path
     names: list[str] = []
+    at: int | None = None
     for _ in range(model.njoints):
-        path = None if source is None else source.urdf_path
         at = undetermined_joint(model, mechanism.q0, path, ROTOR_INERTIA)
-        if at is None:
+        if at is None:  # then none moves less, either
             break
         own = slice(model.idx_vs[at], model.idx_vs[at] + model.nvs[at])
         if not model.damping[own].all():
@@ -369,14 +371,16 @@ def _with_rotors(mechanism: Mechanism) -> Mechanism:
         composite = np.diag(pin.crba(model, workspace(model), mechanism.q0))
         armature[own] += 2.0 * ROTOR_INERTIA * composite[own]
         model.armature = armature
+    if at is not None:
+        at = undetermined_joint(model, mechanism.q0, path)
     if not names:
-        return mechanism
+        return mechanism, at
     note = (
         f"the inertia that {', '.join(map(repr, names))} moves vanishes in one direction at the "
         f"start: damping determines the motion there, and a rotor of {2.0 * ROTOR_INERTIA:g} of "
         "what the joint carries is added; give the links at its end a moment of inertia"
     )
-    return replace(mechanism, model=model, notes=(*mechanism.notes, note))
+    return replace(mechanism, model=model, notes=(*mechanism.notes, note)), at
 
 
 ALMOST_CLOSED = 1e-5
@@ -446,8 +450,7 @@ def assembled(reading: Reading) -> Mechanism:
             if note:
                 mechanism = replace(reduced, notes=(*reduced.notes, note))
         # The mass matrix has to be regular before the analysis factorises it.
-        mechanism = _with_rotors(consistent_start(mechanism, q, v).mechanism)
-        joint = undetermined_joint(mechanism.model, mechanism.q0, source.urdf_path)
+        mechanism, joint = _with_rotors(consistent_start(mechanism, q, v).mechanism)
         if joint is None:
             _analysed(mechanism, reading.analysis)
     except AssemblyError as error:

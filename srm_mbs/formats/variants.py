@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 from srm_mbs.errors import InputError
@@ -84,7 +84,7 @@ class KnownLinkage:
                     or own != table | {"a": own["a"], "b": own["b"]}
                 ):
                     return None
-                closure = replace(closure, a=Anchor(**ends["a"]), b=Anchor(**ends["b"]))
+                closure = closure.between(Anchor(**ends["a"]), Anchor(**ends["b"]))
             found.append(closure)
         keys = [key.name for key in fields(LoopClosure) if key.name != "name"]
         different = {tuple(getattr(one, key) for key in keys) for one in found}

@@ -115,6 +115,15 @@ class ClosureRows:
         self._rows.evaluate(self._model, self._data, q)
         return self._rows.g.copy(), self._rows.G.copy()
 
+    def jacobians(self, q: FloatArray) -> FloatArray:
+        """G (n, m, nv) at n configurations q (n, nq), otherwise as :meth:`at`."""
+        if self._kernel is not None:
+            try:
+                return self._kernel.jacobians(np.zeros(len(q)), q)  # type: ignore[no-any-return]
+            except ArithmeticError:
+                pass
+        return np.array([self.at(each)[1] for each in q])
+
     def evaluate(self, q: FloatArray) -> None:
         """Evaluate g and G as :meth:`at`."""
         self.g, self.G = self.at(q)

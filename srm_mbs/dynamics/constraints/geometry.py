@@ -33,6 +33,9 @@ from srm_mbs.dynamics.scaling import constraint_units, coordinate_units, row_uni
 from srm_mbs.model.drives import in_order_of_rows, positions
 from srm_mbs.model.mechanism import MechanismData, per_model, per_start
 
+CLEARLY_MORE = 1e-12
+"""Mean square of the norm of a row, in units, above which it is no rounding: that of one without
+cancelled terms, 1e-24 of which is rounding, is at most nv^3 in a mechanism at the origin."""
 OPEN_SAMPLES = 8
 """Random open configurations from which the usual norms of rows are measured."""
 
@@ -108,52 +111,63 @@ class ClosureGeometry:
         return _row_size_at_start(self.mechanism) if at_start else self._measured_row_size()
 
     @cached_property
-    def _open_norms(self) -> tuple[FloatArray, tuple[float, float]]:
-        """Mean squares over open configurations of the norms of rows (rows,) and, if no terms in
-        rows cancelled, of one along a direction and of one of an alignment: their rounding is eps
-        times it."""
+    def _open_configurations(self) -> FloatArray:
+        """Open configurations (n, nq), from which usual norms are measured."""
         rng, model = np.random.default_rng(0), self.model
         spreads = rng.uniform(-np.pi, np.pi, (OPEN_SAMPLES, model.nv)) * self.coordinate_unit
-        G = np.empty((OPEN_SAMPLES, len(self.row_unit), model.nv))
-        J = np.empty((OPEN_SAMPLES, 6, model.nv))
-        for i, spread in enumerate(spreads):
-            q = pin.integrate(model, self.start, spread)
-            G[i] = self.closure(q)[1]
+        return np.array([pin.integrate(model, self.start, spread) for spread in spreads])
+
+    def _jacobians(self, q: FloatArray) -> FloatArray:
+        """G of :meth:`closure` (n, rows, nv) at n configurations q (n, nq)."""
+        return np.array([self.closure(each)[1] for each in q])
+
+    @cached_property
+    def _squares(self) -> FloatArray:
+        """Mean squares (rows,) of the norms of rows over the open configurations."""
+        G = self._jacobians(self._open_configurations)
+        squares: FloatArray = (G * G).sum(axis=(0, 2)) / len(G)
+        return squares
+
+    @cached_property
+    def _uncancelled(self) -> tuple[float, float]:
+        """The same, if no terms in rows cancelled, of one along a direction and of one of an
+        alignment: the rounding of a row is eps times its norm."""
+        model, places = self.model, self._open_configurations
+        J = np.empty((len(places), 6, model.nv))
+        for i, q in enumerate(places):
             pin.computeJointJacobians(model, self.data, q)
             J[i] = world_jacobian(self.data)
         turn = np.linalg.norm(J[:, 3:], axis=1) * self.coordinate_unit
         shift = np.linalg.norm(J[:, :3], axis=1) * self.coordinate_unit / self.units.length + turn
-        squares = (G * G).sum(axis=(0, 2)) / OPEN_SAMPLES
-        return squares, (
-            float((shift * shift).sum()) / OPEN_SAMPLES,
-            float((turn * turn).sum()) / OPEN_SAMPLES,
-        )
+        along, turning = ((each * each).sum() / len(places) for each in (shift, turn))
+        return float(along), float(turning)
 
     @cached_property
     def idle_rows(self) -> BoolArray:
         """Which rows (rows,) are rounding in all open configurations: they are always satisfied, as
         those out of the plane of a linkage."""
-        squares, (along, turning) = self._open_norms
-        whole = np.zeros(len(squares))
-        at = 0
-        for loop in self.mechanism.loops:
-            lengths, turns, _ = loop.rows.blocks
-            whole[at : at + loop.rows.count][lengths] = along
-            whole[at : at + loop.rows.count][turns] = turning
-            at += loop.rows.count
-        idle: BoolArray = squares <= ROUNDING_ROW**2 * whole
+        idle: BoolArray = self._squares == 0.0
+        if ((self._squares < CLEARLY_MORE) & ~idle).any():
+            whole, at = np.zeros(len(idle)), 0
+            for loop in self.mechanism.loops:
+                for block, size in zip(loop.rows.blocks, self._uncancelled):
+                    whole[at : at + loop.rows.count][block] = size
+                at += loop.rows.count
+            idle = self._squares <= ROUNDING_ROW**2 * whole
         return idle
 
     def _measured_row_size(self) -> FloatArray:
-        squares, uncancelled = self._open_norms
-        squares, at = squares.copy(), 0
+        squares, at = self._squares.copy(), 0
         for loop in self.mechanism.loops:
             own = squares[at : at + loop.rows.count]
-            for block, whole in zip(loop.rows.blocks[:2], uncancelled):
+            for kind, block in enumerate(loop.rows.blocks[:2]):
                 if block.stop > block.start:
                     mean = own[block].mean()
-                    # Always satisfied: rounding must not be scaled up to a row.
-                    own[block] = mean if mean > ROUNDING_ROW**2 * whole else whole
+                    if not mean > CLEARLY_MORE and mean <= ROUNDING_ROW**2 * (
+                        whole := self._uncancelled[kind]
+                    ):
+                        mean = whole  # always satisfied: rounding must not be scaled up to a row
+                    own[block] = mean
             at += loop.rows.count
         return np.sqrt(np.where(squares > 0.0, squares, 1.0))
 

@@ -356,7 +356,7 @@ def row_algebra(pattern: BoolArray, model: pin.Model | None = None) -> RowAlgebr
 def _compiled(pattern: BoolArray, parents: Sequence[int], order: Sequence[int]) -> CompiledAlgebra:
     from srm_mbs._kernel import core
 
-    supports = [np.flatnonzero(p).tolist() for p in pattern]
+    supports = [[j for j, used in enumerate(row) if used] for row in pattern.tolist()]
     return CompiledAlgebra(
         core.Algebra(list(parents), supports, list(order), PIVOT_SHARE, PIVOT_WINDOW, "auto")  # type: ignore[union-attr]
     )

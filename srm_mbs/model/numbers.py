@@ -194,6 +194,10 @@ def vector(values: Any, name: str, element: str | None = None) -> tuple[float, f
     InputError
         About ``element``, by default ``name``, if they are anything else.
     """
+    if type(values) in (tuple, list) and len(values) == 3:
+        x, y, z = values
+        if type(x) is type(y) is type(z) is float and math.isfinite(x + y + z):
+            return (x, y, z)
     x, y, z = finite_numbers(values, 3, name, "Give [x, y, z]", element)
     return (x, y, z)
 

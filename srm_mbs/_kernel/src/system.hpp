@@ -213,6 +213,11 @@ public:
     void closures_at(double t, const double* q, double* g, double* G, int width);
     // The entries of these rows that may differ from zero, into G.
     void write_rows(double t, const double* q, double* G, int width);
+    // The same rows, without those of drives, of a system without algebra of its own, and M (nv, nv)
+    // and the Jacobian J (6, nv) of the joints in the world, column by column (manifold.cpp).
+    void rows_and_mass(const double* q, double* G);
+    const double* mass_matrix() const;
+    const double* world_jacobian() const;
     // The coordinates that their differences may move together.
     const ColumnGroups& column_groups();
     int rows() const { return data_.rows; }
@@ -236,8 +241,10 @@ public:
     // rows; of its closures the wrenches (closures, 6) on b at b's origin; and of the joints those
     // (njoints, 6) of the parent on the child at the joint's origin: force, moment, in world axes.
     // Placements and velocities of the stage are the same afterwards, its other terms are lost.
+    // The rows that this system has are `kept` of these, in their order.
     void reactions(double t, const double* state, System& all, const double* scale,
-                   double* multipliers, double* on_b, double* joints);
+                   const std::vector<int>& kept, double* multipliers, double* on_b,
+                   double* joints);
     std::size_t closure_count() const { return data_.closures.size(); }
     int joint_count() const;
     void mass_times(const double* x, double* out) const;
@@ -297,6 +304,10 @@ public:
 private:
     Pattern pattern() const;
     void move_bodies(const double* state);
+    // Multipliers of the stage evaluated last, in the `kept` of all rows; false where rows depend
+    // on each other, or leave shares of others.
+    bool kept_multipliers(const double* generalised, const double* scale,
+                          const std::vector<int>& kept, double* out);
     // Those (rows,) of generalised forces of the closures (nv,), of rows G (rows, nv + 1).
     void row_multipliers(const double* generalised, const std::vector<double>& G,
                          const double* scale, int rows, double* out);

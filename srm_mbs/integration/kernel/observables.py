@@ -142,8 +142,12 @@ class CompiledObservables(Observables):
             return super().reactions(t, q, v)
         try:
             with workspace(system) as kernel_system, self._all_rows() as all_rows_system:
+                structure = self.mechanism.structure
                 lam, on_b, joints = kernel_system.reactions(
-                    all_rows_system, self.mechanism.structure.row_scale, *_states(t, q, v)
+                    all_rows_system,
+                    structure.row_scale,
+                    np.flatnonzero(structure.kept).tolist(),
+                    *_states(t, q, v),
                 )
         except ArithmeticError:
             return super().reactions(t, q, v)  # raises the error that says why

@@ -20,7 +20,7 @@ from srm_mbs.integration.kernel.system import make_kernel_system
 from tests.support.bundled import load
 from tests.support.dynamics import mass_matrix, nonlinear_effects
 from tests.support.generated import GeneratedFunction
-from tests.support.mechanisms import along_x, rod
+from tests.support.mechanisms import DISTINCT_MODELS, along_x, rod
 
 pytestmark = [
     pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}"),
@@ -184,7 +184,7 @@ def test_evaluations_of_many_loops_are_those_of_the_kernel(loops: int) -> None:
     _agree(mechanism, count=2)
 
 
-@pytest.mark.parametrize("name", srm.bundled_models())
+@pytest.mark.parametrize("name", DISTINCT_MODELS)
 def test_evaluations_of_bundled_mechanisms_are_those_of_the_kernel(name: str) -> None:
     _agree(load(name))
 

@@ -19,7 +19,7 @@ from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.kernel import backend as kernel
 from srm_mbs.integration.kernel.observables import CompiledObservables
 from tests.support.bundled import load
-from tests.support.mechanisms import floating_ring, random_state
+from tests.support.mechanisms import DISTINCT_MODELS, floating_ring, random_state
 
 pytestmark = pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
 
@@ -172,7 +172,7 @@ def agrees_with_lapack(mechanism: srm.Mechanism, t: FloatArray, q: FloatArray) -
     return found
 
 
-@pytest.mark.parametrize("name", srm.bundled_models())
+@pytest.mark.parametrize("name", DISTINCT_MODELS)
 def test_smallest_singular_values_are_those_of_the_plain_computation(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -287,7 +287,7 @@ def assert_same_reactions(mechanism: srm.Mechanism, tolerance: float = 1e-9) -> 
     np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-10 * np.abs(b).max())
 
 
-@pytest.mark.parametrize("name", [*srm.bundled_models(), "n_four_bar_12"])
+@pytest.mark.parametrize("name", [*DISTINCT_MODELS, "n_four_bar_12"])
 def test_reactions_are_those_of_the_reference(name: str) -> None:
     assert_same_reactions(load(name))
 

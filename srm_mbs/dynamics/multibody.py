@@ -453,8 +453,8 @@ class Mechanics(Manifold):
         return {
             "unit": self._unit,
             "gap_scale": np.zeros(0),
-            "damping": self._damping if self._damping.any() else None,
-            "friction": self._friction if self._friction.any() else None,
+            "damping": self._damping if any(self._damping.tolist()) else None,
+            "friction": self._friction if any(self._friction.tolist()) else None,
         }
 
     def constants_of_model(self) -> dict[str, Any]:

@@ -370,9 +370,7 @@ class MechanismData(ResultOwner):
     def _at_no_start(self) -> Self:
         """A copy that shares the results for the model and has none for the start."""
         changed = object.__new__(type(self))
-        for entry in fields(self):
-            object.__setattr__(changed, entry.name, getattr(self, entry.name))
-        object.__setattr__(changed, "_model_results", self._model_results)
+        vars(changed).update(vars(self))
         object.__setattr__(changed, "_start_results", {})
         return changed
 

@@ -41,7 +41,9 @@ def finite_array(
         len(shape) == array.ndim
         and all(length in (None, actual) for length, actual in zip(shape, array.shape))
     )
-    return array if fits and np.isfinite(array).all() else None
+    if not fits or not np.logical_and.reduce(np.isfinite(array), axis=None):
+        return None
+    return array
 
 
 def flag(value: Any, name: str) -> bool:

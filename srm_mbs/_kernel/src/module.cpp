@@ -981,8 +981,9 @@ struct PySteps {
         bool same = array.ndim() == shape.size();
         for (std::size_t i = 0; same && i < shape.size(); ++i)
             same = array.shape(i) == shape.begin()[i];
+        if (same) return;
         const std::string place = std::string("StepArrays.") + field;
-        if (!same) throw nb::value_error((place + " has another shape").c_str());
+        throw nb::value_error((place + " has another shape").c_str());
     }
 };
 

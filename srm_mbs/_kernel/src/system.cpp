@@ -627,16 +627,17 @@ void System::use_code(const GeneratedTerms* code) {
     }
     code_ = code;
     if (!closed_) return;
-    GeneratedTerms::Factor* const factor = code ? code->factor() : nullptr;
-    if (factor && !generated_projection_)
-        generated_projection_ =
-            make_generated_projection(nv, data_.rows, data_.structural_rank, data_.sigma_ref);
-    if ((factor != nullptr) != uses_generated_projection_) {
-        std::swap(projection_, generated_projection_);
+    const GeneratedAlgebra* const algebra = code ? code->algebra() : nullptr;
+    if ((algebra != nullptr) != (by_code_ != nullptr)) {
+        // The other one waits in its place.
+        if (algebra && !other_projection_)
+            other_projection_ = std::make_unique<GeneratedProjection>(
+                nv, data_.rows, data_.structural_rank, data_.sigma_ref, *algebra);
+        std::swap(projection_, other_projection_);
         projection_->factorisations = 0;
-        uses_generated_projection_ = factor != nullptr;
+        by_code_ = algebra ? static_cast<GeneratedProjection*>(projection_.get()) : nullptr;
     }
-    if (factor) projection_->use_factor(factor);
+    if (algebra) by_code_->use(*algebra);
 }
 
 // M, the forces f and the rows of the closures, by generated code.
@@ -649,7 +650,11 @@ void System::generated_terms(double t, const double* state, ForceLaws* laws) {
             curve.at(t, s);
             law_values_[law++] = s[0];
         }
-    for (int row = 0; row < data_.rows; ++row) columns_of_rows_[row] = column(row);
+    double* const* rows = columns_of_rows_.data();
+    if (by_code_)
+        rows = by_code_->rows_for_code();
+    else
+        for (int row = 0; row < data_.rows; ++row) columns_of_rows_[row] = column(row);
     const bool joined = laws && !joined_.empty();
     if (joined) {
         passive_joined();
@@ -662,7 +667,7 @@ void System::generated_terms(double t, const double* state, ForceLaws* laws) {
                          laws && laws->applied ? laws->applied + first : nullptr,
                          w.data.M.data(), w.data.nle.data(), f_.data(), lawful,
                          held_values_.data(), own_laws_.data(), g_.data(), bias_.data(),
-                         columns_of_rows_.data(), bushing_bodies_.data(), w.data.J.data()))
+                         rows, bushing_bodies_.data(), w.data.J.data()))
         throw EvaluationError{Failure::coincident};
     if (laws) {
         std::copy(held_values_.begin(), held_values_.end(), laws->values.begin() + first);

@@ -19,6 +19,7 @@
 #include "curve.hpp"
 #include "forces.hpp"
 #include "generated.hpp"
+#include "generated_projection.hpp"
 #include "history.hpp"
 #include "projection.hpp"
 #include "struct_fields.hpp"
@@ -198,7 +199,9 @@ public:
 
     // The manifold.
     void retract(const double* state, const double* delta, double* out);
-    // Angles of (cos, sin) joints take the turn nearest to the motion near (nv,).
+    // Whether joints have angles of which only cosine and sine are known.
+    bool wraps() const { return !data_.wrapped_angles.empty(); }
+    // Such angles take the turn nearest to the motion near (nv,), which others do not need.
     void difference(const double* start, const double* end, const double* near, double* out);
     bool reachable(const double* start, const double* end) const;
     void chart_rate(const double* delta, const double* rate, double* out) const;
@@ -226,8 +229,6 @@ public:
     // `elements`, each by itself, at the rates of the state or, if it is `resting`, those of its
     // force at rest.
     void closure_errors(double t, const double* state, double* g, double* rates);
-    // Whether joints have angles of which only cosine and sine are known.
-    bool wraps() const { return !data_.wrapped_angles.empty(); }
     std::array<double, 2> energies(const double* state);
     void powers(double t, const double* state, const std::vector<ForceElement>& elements,
                 bool resting, double* out);
@@ -339,8 +340,8 @@ private:
     void joined_laws_by_state(const double* state, const double* a, double* out);
     void controller_by_state(double t, const double* state, const std::vector<double>& steps);
     const GeneratedTerms* code_ = nullptr;
-    std::unique_ptr<Projection> generated_projection_;  // or the other one, while it is in use
-    bool uses_generated_projection_ = false;
+    std::unique_ptr<Projection> other_projection_;  // that with generated algebra, or without it
+    GeneratedProjection* by_code_ = nullptr;        // the one in use, if its algebra is generated
     std::vector<double> law_values_;  // of the forces' curves, for generated code
     std::vector<double*> columns_of_rows_;
     std::vector<double*> bushing_bodies_;  // the memory of their kinematics

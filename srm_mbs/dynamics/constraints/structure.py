@@ -510,7 +510,8 @@ class Structure:
 
     def at(self, mechanism: MechanismData) -> Structure:
         """The same facts with the units of ``mechanism``, which differs in its start only."""
-        return replace(self, units=coordinate_units(mechanism, mechanism.q0, mechanism.v0))
+        units = coordinate_units(mechanism, mechanism.q0, mechanism.v0)
+        return self if units is self.units else replace(self, units=units)
 
     @property
     def redundant_rows(self) -> tuple[str, ...]:

@@ -132,7 +132,7 @@ class CompiledObservables(Observables):
 
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         with self._all_rows() as kernel_system:
-            return kernel_system.energies(np.hstack([q, v]))  # type: ignore[no-any-return]
+            return kernel_system.energies(np.concatenate((q, v), axis=1))  # type: ignore[no-any-return]
 
     def reactions(self, t: FloatArray, q: FloatArray, v: FloatArray) -> Reactions:
         """As the reference, by one evaluation of each state; the reference itself where functions
@@ -228,4 +228,4 @@ def _separated_rows(
 
 def _states(t: FloatArray, q: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and states (n, nx), as the kernel takes them."""
-    return np.ascontiguousarray(t, dtype=float), np.hstack([q, v])
+    return np.ascontiguousarray(t, dtype=float), np.concatenate((q, v), axis=1)

@@ -353,5 +353,5 @@ def test_the_first_step_agrees(name: str) -> None:
             max_step=np.inf,
             placed="automatic",
         )
-        found = run.snapshot().control.h
+        found = run.core.snapshot().control.h
         assert found == pytest.approx(expected, rel=1e-9 / min(1.0, memory.sigma) ** 2)

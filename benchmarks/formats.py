@@ -130,12 +130,14 @@ def main() -> None:
     parser.add_argument("--verbose", action="store_true", help="print each file")
     arguments = parser.parse_args()
     files = model_files(arguments.dir)
+    outcomes = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        outcomes = list(pool.map(lambda file: attempt(*file, arguments.seconds), files))
-    if arguments.verbose:
-        for outcome in outcomes:
-            place = outcome.path.relative_to(arguments.dir)
-            print(f"{outcome.kind:8} {outcome.seconds:6.1f} s  {place}  {outcome.reason}")
+        for outcome in pool.map(lambda file: attempt(*file, arguments.seconds), files):
+            outcomes.append(outcome)
+            if arguments.verbose:
+                place = outcome.path.relative_to(arguments.dir)
+                line = f"{outcome.kind:8} {outcome.seconds:6.1f} s  {place}  {outcome.reason}"
+                print(line, flush=True)
     print(table(arguments.dir, outcomes))
     print(reasons(outcomes))
 

@@ -6,13 +6,13 @@ import ast
 import re
 import subprocess
 import sys
-from pathlib import Path
+from functools import cache
 
 import pytest
 
 import srm_mbs
+from tests.support.sources import MODULES, PACKAGE, syntax_tree
 
-PACKAGE = Path(srm_mbs.__file__).parent
 ORDER = (
     {"_typing", "errors", "_kernel"},
     {"model"},
@@ -30,19 +30,16 @@ ORDER = (
 )
 """Folders and modules at the top of the package, from the ground up (docs/contributing.md)."""
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
-MODULES = {
-    ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
-    for path in sorted(PACKAGE.rglob("*.py"))
-}
 
 
+@cache
 def imports_of(module: str) -> set[str]:
     """Modules of the package that ``module`` imports anywhere: at its top, in functions, for type
     checking, and by ``import_module``."""
     path = MODULES[module]
     package = ["srm_mbs", *path.relative_to(PACKAGE).parent.parts]
     named: list[str] = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(syntax_tree(module)):
         if isinstance(node, ast.Import):
             named += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -61,9 +58,6 @@ def imports_of(module: str) -> set[str]:
     return found - {module}
 
 
-GRAPH = {module: imports_of(module) for module in MODULES}
-
-
 def test_the_top_of_the_package_has_the_folders_of_the_map_only() -> None:
     assert {module.split(".")[0] for module in MODULES} == set(RANK)
 
@@ -71,13 +65,13 @@ def test_the_top_of_the_package_has_the_folders_of_the_map_only() -> None:
 @pytest.mark.parametrize("module", MODULES)
 def test_every_import_goes_down(module: str) -> None:
     own = module.split(".")[0]
-    for target in GRAPH[module]:
+    for target in imports_of(module):
         other = target.split(".")[0]
         assert other == own or RANK[other] < RANK[own], f"{module} imports {target}"
 
 
 def test_no_imports_go_in_a_circle() -> None:
-    left = dict(GRAPH)
+    left = {module: imports_of(module) for module in MODULES}
     while left:
         free = [module for module, targets in left.items() if not targets & set(left)]
         assert free, f"in or above a circle: {sorted(left)}"
@@ -87,7 +81,7 @@ def test_no_imports_go_in_a_circle() -> None:
 
 @pytest.mark.parametrize("module", MODULES)
 def test_no_module_imports_private_names_of_another(module: str) -> None:
-    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+    for node in ast.walk(syntax_tree(module)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("srm_mbs"):
             private = [
                 alias.name
@@ -102,7 +96,7 @@ INTEGRATION = [module for module in MODULES if module.startswith("integration.")
 
 @pytest.mark.parametrize("module", INTEGRATION)
 def test_integration_asks_the_protocol_of_systems_not_their_classes(module: str) -> None:
-    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+    for node in ast.walk(syntax_tree(module)):
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance":
             assert not re.search(r"System\b", ast.unparse(node.args[1])), ast.unparse(node)
 

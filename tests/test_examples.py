@@ -123,6 +123,8 @@ def test_the_notebook_of_a_tutorial_has_the_steps_of_its_page(name: str) -> None
     assert committed == tutorials.notebook(name, text), "run python -m tools.tutorials"
 
 
+# By default the blocks of the page itself are run (tests/test_documentation.py).
+@pytest.mark.stress
 @pytest.mark.parametrize("name", TUTORIALS)
 def test_the_notebook_of_a_tutorial_prints_and_draws_what_its_page_shows(
     name: str, tmp_path: Path

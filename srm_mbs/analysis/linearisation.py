@@ -24,6 +24,7 @@ from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import TangentChart, differences, tangent_basis
 from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
 from srm_mbs.dynamics.controllers import Controller
+from srm_mbs.dynamics.forces import friction_sums, resolved_forces
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.singularities.local_analysis import TAU
@@ -277,8 +278,8 @@ def linearise(
     start = chart.left @ (v / unit)
     velocities = chart.basis
     size = max(mechanism.structure.units.rate, float(np.abs(start).max(initial=0.0)))
-    rough = mechanism.model.friction > 0.0
-    reach = np.abs(unit[:, None] * velocities)[rough].max(initial=0.0)
+    rubs = friction_sums(mechanism.model, resolved_forces(mechanism))
+    reach = np.abs(rubs @ (unit[:, None] * velocities)).max(initial=0.0)
     if reach > 0.0:
         size = min(size, FRICTION_STEP * mechanism.friction_speed / (reach * step))
     steps = step * np.concatenate([np.ones(k), np.full(k, size)])

@@ -245,6 +245,10 @@ def _polynomial_relation(loop: LoopClosure, polynomial: Sequence[float]) -> str:
     return f"{left} = {terms}, y = {right}"
 
 
+RARE = ("slack", "friction")
+"""Values of force elements that are listed where they are not zero."""
+
+
 def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
     """(name, type, joint or anchors, values with units) of each force element."""
     for force in mechanism.forces:
@@ -258,7 +262,7 @@ def force_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
             elif key.name == "joints":
                 places += value
             elif key.name != "name":
-                if value is None:
+                if value is None or (key.name in RARE and not value):
                     continue
                 units = key.metadata.get("unit", "").split(", ")
                 text = f"{value:.6g}" if isinstance(value, float) else value

@@ -105,14 +105,12 @@ def _of_joints(mechanism: Mechanism) -> list[_Named]:
         joint = mechanism.joint(name)
         for i in range(joint.idx_v, joint.idx_v + joint.nv):
             direction = np.eye(1, model.nv, i)[0]
-            rate = "rad/s" if angles[i] else "m/s"
             if d := float(model.damping[i]):
                 one = Coefficient("damping", d, direction, angles[i])
                 found.append((name, one, _text(one)))
             if F := float(model.friction[i]):
                 one = Coefficient("friction", F / speed, direction, angles[i])
-                text = f"friction {F:.6g} {'N m' if angles[i] else 'N'} at {speed:g} {rate}"
-                found.append((name, one, text))
+                found.append((name, one, _friction_text(one, speed)))
     return found
 
 
@@ -124,11 +122,18 @@ def _of_forces(mechanism: Mechanism) -> list[_Named]:
     model, data = mechanism.model, workspace(mechanism.model)
     pin.forwardKinematics(model, data, mechanism.q0, mechanism.v0)
     pin.computeJointJacobians(model, data)
+    speed = mechanism.friction_speed
     return [
-        (f"force {force.name}", one, _text(one))
+        (f"force {force.name}", one, _friction_text(one, speed) if rubs else _text(one))
         for force, own in zip(mechanism.forces, forces.coefficients(data))
         for one in own
+        for rubs in (one.kind == "friction",)
     ]
+
+
+def _friction_text(one: Coefficient, speed: float) -> str:
+    force, rate = ("N m", "rad/s") if one.angular else ("N", "m/s")
+    return f"friction {one.value * speed:.6g} {force} at {speed:g} {rate}"
 
 
 def _text(one: Coefficient) -> str:

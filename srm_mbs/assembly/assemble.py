@@ -7,6 +7,7 @@ initial ones, hold their coordinates where their laws begin.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -229,13 +230,14 @@ def consistent_start(
     consistent = assemble_velocity(mechanism, problem, closed, rates, held_rates, at_rest)
     same = np.array_equal(consistent, at_rest.v0)
     found = at_rest if same else mechanism.with_state(closed, consistent)
-    residuals, _ = found.initial_errors
-    log.debug(
-        "%s: assembled with %s held, closed to %.1e",
-        mechanism.name,
-        ", ".join(held) or "no joint",
-        np.abs(residuals).max(initial=0.0),
-    )
+    if log.isEnabledFor(logging.DEBUG):
+        residuals, _ = found.initial_errors
+        log.debug(
+            "%s: assembled with %s held, closed to %.1e",
+            mechanism.name,
+            ", ".join(held) or "no joint",
+            np.abs(residuals).max(initial=0.0),
+        )
     return ConsistentStart(found, problem, at_rest)
 
 

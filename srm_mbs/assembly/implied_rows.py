@@ -22,6 +22,7 @@ from srm_mbs.assembly.position import CONSTRAINT_TOLERANCE, ClosureProblem, clos
 from srm_mbs.dynamics.constraints.projection import pivoted_qr
 from srm_mbs.dynamics.constraints.row_algebra import min_norm_solution
 from srm_mbs.dynamics.constraints.structure import (
+    CLOSING_STEPS,
     STRUCTURAL_PIVOT,
     WALK_AMPLITUDE,
     ManifoldSampler,
@@ -171,7 +172,7 @@ def _motion(reduced: Mechanism, start: FloatArray) -> Iterator[FloatArray]:
     """Configurations along the motion of the ``reduced`` mechanism from ``start`` (nq,)."""
     units = coordinate_units(reduced, start, np.zeros(reduced.model.nv))
     sampler = ManifoldSampler(reduced, units)
-    closed, _ = sampler.close(start)
+    closed, _ = sampler.close(start, CLOSING_STEPS)
     yield closed
     yield from sampler.walk(closed, np.random.default_rng(0), WALKS, STEPS)
 

@@ -20,7 +20,8 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
-from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.compiled_rows import ClosureRows, compiled_rows
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, loop_rows
 from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.constraints.row_algebra import min_norm_solution, smallest_singular_value
 from srm_mbs.dynamics.constraints.rows import support, world_jacobian
@@ -32,6 +33,8 @@ from srm_mbs.model.mechanism import MechanismData, per_model
 
 CONSTRAINT_TOLERANCE = 1e-12
 """Largest closure error of an assembled state, in rad and in scene diagonals."""
+EXACTLY_CLOSED = 1e-15
+"""Closure error, in the same units, that is rounding: no step makes it smaller for certain."""
 AXES_TOLERANCE = 1e-2
 """Largest mismatch of an assembled state: larger ones have axes in the opposite sense."""
 RANK_TOLERANCE = 1e-10
@@ -60,8 +63,48 @@ def _periodic_coordinates(mechanism: MechanismData) -> BoolArray:
     return periodic_coordinates(mechanism.model)
 
 
+@per_model
+def _compiled_loop_rows(mechanism: MechanismData) -> ClosureRows:
+    if not mechanism.drives:
+        return compiled_rows(mechanism)
+    return ClosureRows(mechanism.model, loop_rows(mechanism).copy_workspace())
+
+
 class ClosureProblem(ClosureGeometry):
-    """The closure equations of a mechanism, and the distance from the intended closed state."""
+    """The closure equations of a mechanism, and the distance from the intended closed state.
+
+    The rows that were evaluated last are kept: assembly asks several times for those of one
+    configuration."""
+
+    _latest: tuple[bytes, FloatArray, FloatArray, FloatArray] | None = None
+
+    def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As of every geometry, by the kernel where there is one; nothing may change the arrays."""
+        key = q.tobytes()
+        if self._latest is None or self._latest[0] != key:
+            g, G = _compiled_loop_rows(self.mechanism).at(q)
+            found = g / self.row_unit, G / self.row_unit[:, None] * self.unit
+            for array in found:
+                array.setflags(write=False)
+            self._latest = key, q.copy(), *found
+        return self._latest[2:]
+
+    def _jacobians(self, q: FloatArray) -> FloatArray:
+        G = _compiled_loop_rows(self.mechanism).jacobians(q)
+        out: FloatArray = G / self.row_unit[:, None] * self.unit
+        return out
+
+    def mass(self) -> FloatArray:
+        """As of every geometry."""
+        if self._latest is not None:
+            pin.crba(self.model, self.data, self._latest[1], pin.Convention.WORLD)
+        return super().mass()
+
+    def _placed(self) -> pin.Data:
+        """Placements and Jacobian of the joints where the rows were evaluated last."""
+        if self._latest is not None:
+            pin.computeJointJacobians(self.model, self.data, self._latest[1])
+        return self.data
 
     @cached_property
     def _unambiguous(self) -> list[IndexArray]:
@@ -95,12 +138,10 @@ class ClosureProblem(ClosureGeometry):
         """Numbers of the loops, and velocity indices of the coordinates that move them, of the
         smallest groups of loops that share no coordinate: each closes by itself."""
         out: list[tuple[list[int], set[int]]] = []
+        pattern, row = loop_rows(self.mechanism).pattern(), 0
         for number, loop in enumerate(self.mechanism.loops):
-            if loop.joints is None:
-                (a, _), (b, _) = loop.resolve(self.model)
-                own = set(np.flatnonzero(support(self.model, a) != support(self.model, b)).tolist())
-            else:
-                own = {self.mechanism.joint(name).idx_v for name in loop.joints}
+            rows = pattern[row : row + loop.rows.count]
+            own, row = set(np.flatnonzero(rows.any(axis=0)).tolist()), row + loop.rows.count
             numbers = [number]
             for group in [group for group in out if group[1] & own]:
                 out.remove(group)
@@ -144,8 +185,9 @@ class ClosureProblem(ClosureGeometry):
             parts.append(G[rows])
             if len(loop.rows.matched):
                 _, (joint_b, in_b), moves = self._matching[loop.name]
-                into_b = (self.data.oMi[joint_b] * in_b).rotation.T
-                turn = into_b @ (world_jacobian(self.data)[3:] * moves * self.unit)
+                data = self._placed()
+                into_b = (data.oMi[joint_b] * in_b).rotation.T
+                turn = into_b @ (world_jacobian(data)[3:] * moves * self.unit)
                 parts += [-pin.skew(axis) @ turn for axis in self._axes_in_b(loop)]
         return np.concatenate(parts)
 
@@ -169,7 +211,8 @@ class ClosureProblem(ClosureGeometry):
 
     def _axes_in_b(self, loop: LoopClosure) -> FloatArray:
         """The matched axes of a in the frame of b (c, 3), where the rows were evaluated last."""
-        a, b = (self.data.oMi[joint] * inside for joint, inside in self._matching[loop.name][:2])
+        data = self._placed()
+        a, b = (data.oMi[joint] * inside for joint, inside in self._matching[loop.name][:2])
         out: FloatArray = loop.rows.matched @ (b.rotation.T @ a.rotation).T
         return out
 
@@ -199,6 +242,8 @@ class ClosureProblem(ClosureGeometry):
 
     def unwrapped(self, q: FloatArray) -> FloatArray:
         """q with its periodic angles within half a turn of those at the start."""
+        if np.abs(q - self.start).max() < 0.5 * np.pi:  # of (cos, sin) pairs and quaternions, too
+            return q
         own = self._periodic[0]
         turns = np.round((q[own] - self.start[own]) / (2.0 * np.pi))
         q = q.copy()
@@ -312,7 +357,8 @@ def close_positions(
     ``bounds`` are the least and largest motions of these, in units.
     """
     if np.linalg.norm(problem.mismatch(q)) <= CONSTRAINT_TOLERANCE:
-        return problem.unwrapped(polish(problem, q, free))
+        exact = np.abs(problem.closure(q)[0]).max() <= EXACTLY_CLOSED
+        return problem.unwrapped(q if exact else polish(problem, q, free))
     for near in (True, False):  # without damping where no configuration near q is closed
         found = polish(problem, _search(problem, q, free, steps, bounds, near=near), free)
         if problem.closed(found):

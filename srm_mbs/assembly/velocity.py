@@ -76,7 +76,8 @@ def assemble_velocity(
     G = np.concatenate([G, drives.rows])
     prescribed = np.concatenate([np.zeros(len(G) - len(drives.rates)), drives.rates])
     normalised = np.concatenate([problem.normalised(q), drives.rows])
-    conditions, close = _conditions(analysed, problem, q, drives)
+    smallest = smallest_singular_value(normalised, EXACTLY)
+    conditions, close = _conditions(analysed, problem, q, drives, smallest)
     fastest = float(np.abs(np.concatenate([v / problem.unit, drives.rates])).max())
 
     def onto_rows(
@@ -111,7 +112,7 @@ def assemble_velocity(
         return u, float(np.abs(G @ u - prescribed).max()), moves
 
     # Next to a singular configuration q lies off its branch by round-off over the distance.
-    smallest = min(smallest_singular_value(normalised, EXACTLY), 1.0)
+    smallest = min(smallest, 1.0)
     tolerance = max(RATE_TOLERANCE, min(CLOSURE_ROUNDING / smallest, LARGEST_RATE_ERROR))
     tolerance *= max(1.0, fastest)
     solved, error, moves = solve(held)
@@ -178,19 +179,30 @@ def _on_branch(limit: BranchLimit, unit: FloatArray, drives: DriveRows) -> _Cond
 
 
 def _conditions(
-    mechanism: Mechanism, problem: ClosureProblem, q: FloatArray, drives: DriveRows
+    mechanism: Mechanism,
+    problem: ClosureProblem,
+    q: FloatArray,
+    drives: DriveRows,
+    smallest: float,
 ) -> tuple[_Conditions, SingularConfiguration | None]:
-    """The conditions at q, the start of ``mechanism``, and the singular configuration if q is so
-    close to one that the rates determine the branch instead of q."""
+    """The conditions at q, the start of ``mechanism``, where ``smallest`` is the smallest singular
+    value of the closures, and the singular configuration if q is so close to one that the rates
+    determine the branch instead of q."""
     normalised = problem.normalised(q)
-    left = null_basis(np.concatenate([normalised, drives.rows]).T, SINGULAR)
+    used = np.append(~problem.idle_rows, np.ones(len(drives.rates), dtype=bool))
+    left: FloatArray | None = None
 
     def curvature(u: FloatArray) -> FloatArray:
-        out: FloatArray = left.T @ np.concatenate([problem.bias(q, u), drives.bias(u)])
+        nonlocal left
+        if left is None:
+            left = null_basis(np.concatenate([normalised, drives.rows])[used].T, SINGULAR)
+        if not left.shape[1]:
+            return np.zeros(0)
+        out: FloatArray = left.T @ np.concatenate([problem.bias(q, u), drives.bias(u)])[used]
         return out
 
     here = _with_drives(normalised, drives, curvature)
-    if not smallest_singular_value(normalised, EXACTLY) < NEARLY:
+    if not smallest < NEARLY:
         return here, None
     # G determines the rates to round-off over the square of the distance: use the branch.
     rank = mechanism.structure.loop_rank
@@ -215,14 +227,15 @@ def _onto_tangent(
 
     They differ from u by combinations of the columns of ``null`` in the ``free`` coordinates.
     """
-    from scipy.optimize import least_squares
-
     size = float(np.abs(u).max())
+    if size == 0.0:
+        return u
     largest = float(np.abs(curvature(u)).max(initial=0.0))
-    if size == 0.0 or largest <= CURVATURE * size * size < np.inf:
+    if largest <= CURVATURE * size * size < np.inf:
         return u
     if not null.shape[1] or not np.isfinite(largest):  # squares of the rates overflow
         return None
+    from scipy.optimize import least_squares
 
     def bent(w: FloatArray) -> FloatArray:
         out = u.copy()

@@ -452,6 +452,13 @@ class DaeSystem:
         """0: no state is another one's rate."""
         return np.zeros_like(delta)
 
+    friction_speed = np.inf
+
+    @property
+    def friction_sums(self) -> FloatArray:
+        """None: a DAE has no friction."""
+        return np.zeros((0, self.multiplier_part.start))
+
     def friction_tolerance(self, v: FloatArray) -> FloatArray:
         """Infinite: a DAE has no friction."""
         return np.full(self.nx, np.inf)

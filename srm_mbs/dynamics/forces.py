@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from math import copysign, inf, pi, sqrt
+from math import copysign, inf, pi, sqrt, tanh
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -52,7 +52,7 @@ from srm_mbs.model.forces import (
     Wrench,
 )
 from srm_mbs.model.laws import Law
-from srm_mbs.model.mechanism import MechanismData, per_model
+from srm_mbs.model.mechanism import FRICTION_SPEED, MechanismData, per_model
 
 
 class LinkWrench(NamedTuple):
@@ -79,7 +79,7 @@ class Coefficient(NamedTuple):
     Attributes
     ----------
     kind
-        "damping" or "stiffness".
+        "damping", "stiffness", or "friction": F/v_s, what friction damps with at rest.
     value
         c, N s/m or N/m; N m s/rad or N m/rad if ``angular``.
     direction : (nv,)
@@ -209,6 +209,11 @@ class ValuesOverTime:
         return {"numbers": self._numbers, "curves": curves}
 
 
+def stretched(beyond: float, slack: float) -> float:
+    """Stretch of a spring ``beyond`` its rest length, without force up to ``slack`` from there."""
+    return beyond - min(max(beyond, 0.0), slack)
+
+
 class SpringDamperEvaluator(LawEvaluator):
     """A :class:`~srm_mbs.model.forces.SpringDamper`, resolved against a model."""
 
@@ -218,8 +223,8 @@ class SpringDamperEvaluator(LawEvaluator):
         self.support = self.a.support - self.b.support
         self.stiffness, self.damping = force.stiffness, force.damping
         self.rest_length = float(force.rest_length or 0.0)
-
-        self.law_count = 1 if self.rest_length else 0
+        self.slack = force.slack
+        self.law_count = 1 if self.rest_length or self.slack else 0
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         force, at_a, _ = self._force(data)
@@ -267,7 +272,9 @@ class SpringDamperEvaluator(LawEvaluator):
             )
         # k (l - l0) apart/l, without dividing where l = l0 = 0.
         force = -self.stiffness * apart
-        if self.rest_length:
+        if self.slack:
+            force *= stretched(length - self.rest_length, self.slack) / (length or 1.0)
+        elif self.rest_length:
             force *= 1.0 - self.rest_length / length
         if self.damping:
             rate = point_velocity(self.a.velocity(data), at_a)
@@ -280,7 +287,7 @@ class SpringDamperEvaluator(LawEvaluator):
     def coefficients(self, data: pin.Data) -> list[Coefficient]:
         _, at_a, line = self._force(data)
         directions = []
-        for axis in [line] if self.rest_length else np.eye(3):
+        for axis in [line] if self.law_count else np.eye(3):
             directions.append(np.zeros(len(self.support)))
             add_wrench(directions[-1], data, self.support, wrench_at(at_a, axis))
         return [
@@ -292,9 +299,11 @@ class SpringDamperEvaluator(LawEvaluator):
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         apart = self.a.placement(data).translation - self.b.placement(data).translation
-        return 0.5 * self.stiffness * (sqrt(apart @ apart) - self.rest_length) ** 2
+        beyond = sqrt(apart @ apart) - self.rest_length
+        return 0.5 * self.stiffness * stretched(beyond, self.slack) ** 2
 
     def constants(self) -> dict[str, Any]:
+        own = {"numbers": np.array([self.slack])} if self.slack else {}
         return {
             "kind": 0,
             "a": self.a.constants(),
@@ -303,7 +312,7 @@ class SpringDamperEvaluator(LawEvaluator):
             "stiffness": self.stiffness,
             "damping": self.damping,
             "rest": self.rest_length,
-        }
+        } | own
 
 
 class WrenchEvaluator(Evaluator):
@@ -616,7 +625,7 @@ class CouplingSpringEvaluator(LawEvaluator):
 
     law_count = 1
 
-    def __init__(self, model: pin.Model, force: CouplingSpring) -> None:
+    def __init__(self, model: pin.Model, force: CouplingSpring, friction_speed: float) -> None:
         joints = [model.joints[model.getJointId(name)] for name in force.joints]
         # In the order of the velocities, as the kernel has them.
         order = np.argsort([joint.idx_v for joint in joints])
@@ -625,6 +634,7 @@ class CouplingSpringEvaluator(LawEvaluator):
         self.factors = np.array(force.coefficients)[order]
         self.size = model.nv
         self.stiffness, self.damping, self.rest = force.stiffness, force.damping, force.rest
+        self.slack, self.friction, self.speed = force.slack, force.friction, friction_speed
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
         self.apply(tau, data, self.laws(data, q, v))
@@ -638,7 +648,10 @@ class CouplingSpringEvaluator(LawEvaluator):
     ) -> FloatArray:
         """The force on the sum."""
         rate = self.factors @ v[self.in_v]
-        return np.array([-(self.stiffness * self._stretch(q) + self.damping * rate)])
+        force = self.stiffness * self._stretch(q) + self.damping * rate
+        if self.friction:
+            force += self.friction * tanh(rate / self.speed)
+        return np.array([-force])
 
     def apply(
         self,
@@ -650,12 +663,12 @@ class CouplingSpringEvaluator(LawEvaluator):
         tau[self.in_v] += values[0] * self.factors
 
     def _stretch(self, q: FloatArray) -> float:
-        return float(self.factors @ q[self.in_q]) - self.rest
+        return stretched(float(self.factors @ q[self.in_q]) - self.rest, self.slack)
 
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         return 0.5 * self.stiffness * self._stretch(q) ** 2
 
-    def _along(self) -> FloatArray:
+    def along(self) -> FloatArray:
         """The derivatives (nv,) of the sum by the coordinates."""
         along = np.zeros(self.size)
         along[self.in_v] = self.factors
@@ -663,17 +676,23 @@ class CouplingSpringEvaluator(LawEvaluator):
 
     def coefficients(self, data: pin.Data) -> list[Coefficient]:
         angular = bool(np.abs(world_jacobian(data)[3:, self.in_v]).max() > 0.0)
-        return _along_direction(self, self._along(), angular)
+        found = _along_direction(self, self.along(), angular)
+        if self.friction:
+            at_rest = self.friction / self.speed
+            found.append(Coefficient("friction", at_rest, self.along(), angular))
+        return found
 
     def constants(self) -> dict[str, Any]:
+        acts = self.slack or self.friction
+        own = {"numbers": np.array([self.slack, self.friction, self.speed])} if acts else {}
         return {
             "kind": 6,
-            "support": self._along(),
+            "support": self.along(),
             "positions": self.in_q.tolist(),
             "stiffness": self.stiffness,
             "damping": self.damping,
             "rest": self.rest,
-        }
+        } | own
 
 
 class LimitSpringEvaluator(Evaluator):
@@ -756,7 +775,6 @@ _EVALUATORS = {
     Wrench: WrenchEvaluator,
     Bushing: BushingEvaluator,
     LimitSpring: LimitSpringEvaluator,
-    CouplingSpring: CouplingSpringEvaluator,
     UserForce: _UserForceEvaluator,
 }
 
@@ -767,7 +785,16 @@ _LAWFUL = LawEvaluator | TorsionSpringEvaluator | LimitSpringEvaluator
 @per_model
 def resolved_forces(mechanism: MechanismData) -> ForceKinematics | None:
     """The force elements of ``mechanism``, resolved once; None if it has none."""
-    return ForceKinematics(mechanism.model, mechanism.forces) if mechanism.forces else None
+    if not mechanism.forces:
+        return None
+    return ForceKinematics(mechanism.model, mechanism.forces, mechanism.friction_speed)
+
+
+def friction_sums(model: pin.Model, forces: ForceKinematics | None) -> FloatArray:
+    """The rates on which dry friction acts, as sums of velocity components: coefficients (n, nv) of
+    the coordinates with joint friction, and of those with friction of ``forces``."""
+    sums = np.eye(model.nv)[model.friction > 0.0]
+    return sums if forces is None else np.vstack([sums, forces.sums_with_friction()])
 
 
 def over_half_turn(mechanism: MechanismData, q: FloatArray) -> tuple[str, ...]:
@@ -779,12 +806,21 @@ def over_half_turn(mechanism: MechanismData, q: FloatArray) -> tuple[str, ...]:
 
 
 class ForceKinematics:
-    """All force elements of a mechanism: ``forces`` on the tree ``model``."""
+    """All force elements of a mechanism: ``forces`` on the tree ``model``, with the speed over
+    which dry friction changes its sign."""
 
-    def __init__(self, model: pin.Model, forces: Sequence[ForceElement]) -> None:
+    def __init__(
+        self,
+        model: pin.Model,
+        forces: Sequence[ForceElement],
+        friction_speed: float = FRICTION_SPEED,
+    ) -> None:
         self._model, self._nv = model, model.nv
         self._elements: list[Evaluator] = [
-            _EVALUATORS[type(force)](model, force) for force in forces
+            CouplingSpringEvaluator(model, force, friction_speed)
+            if isinstance(force, CouplingSpring)
+            else _EVALUATORS[type(force)](model, force)
+            for force in forces
         ]
 
         self.bushings = [e for e in self._elements if isinstance(e, BushingEvaluator) and e.turns]
@@ -909,6 +945,11 @@ class ForceKinematics:
             if isinstance(element, _UserForceEvaluator):
                 element.add(tau, data, q, v, t)
         return tau
+
+    def sums_with_friction(self) -> FloatArray:
+        """The sums of rates on which dry friction acts: coefficients (n, nv)."""
+        rubs = (e for e in self._elements if isinstance(e, CouplingSpringEvaluator) and e.friction)
+        return np.array([e.along() for e in rubs]).reshape(-1, self._nv)
 
     def coordinates(self) -> list[int]:
         """Velocity indices of the coordinates on which springs and limits act."""

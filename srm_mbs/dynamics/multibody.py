@@ -42,6 +42,7 @@ from srm_mbs.dynamics.forces import (
     BushingStep,
     Evaluator,
     ForceKinematics,
+    friction_sums,
     resolved_forces,
 )
 from srm_mbs.dynamics.manifold import Manifold
@@ -236,7 +237,8 @@ class Mechanics(Manifold):
         self._controller = controller
         self._damping: FloatArray = self.model.damping.copy()
         self._friction: FloatArray = self.model.friction.copy()
-        self._friction_speed = mechanism.friction_speed
+        self._is_damped, self._has_friction = bool(self._damping.any()), bool(self._friction.any())
+        self.friction_speed = mechanism.friction_speed
         self._forces = resolved_forces(mechanism)
         self._first, self._last = -np.inf, np.inf
         self._bushings: dict[Evaluator, BushingStep] = {}
@@ -333,13 +335,18 @@ class Mechanics(Manifold):
 
     def damping_force(self, v: FloatArray) -> FloatArray:
         """Joint damping -d v, for the rates v (nv,) or (n, nv)."""
-        return -self._damping * v if self._damping.any() else np.zeros(v.shape)
+        return -self._damping * v if self._is_damped else np.zeros(v.shape)
 
     def friction_force(self, v: FloatArray) -> FloatArray:
         """Joint friction -F tanh(v / v_s), for the rates v (nv,) or (n, nv)."""
-        if not self._friction.any():
+        if not self._has_friction:
             return np.zeros(v.shape)
-        return -self._friction * np.tanh(v / self._friction_speed)
+        return -self._friction * np.tanh(v / self.friction_speed)
+
+    @cached_property
+    def friction_sums(self) -> FloatArray:
+        """See :class:`~srm_mbs.dynamics.system.System`."""
+        return friction_sums(self.model, self._forces)
 
     @cached_property
     def _law_coordinates(self) -> IndexArray:
@@ -369,9 +376,13 @@ class Mechanics(Manifold):
 
     def friction_tolerance(self, v: FloatArray) -> FloatArray:
         """See :class:`~srm_mbs.dynamics.system.System`."""
-        own = self._friction_speed + FRICTION_PART * np.abs(v)
-        limits = np.where(self._friction != 0.0, own, np.inf)
-        return np.concatenate([np.full(self.nv, np.inf), limits])
+        limits = np.full(2 * self.nv, np.inf)
+        for row in self.friction_sums:
+            own = np.flatnonzero(row)
+            size = self.friction_speed + FRICTION_PART * abs(float(row @ v))
+            at = self.nv + own
+            limits[at] = np.minimum(limits[at], size / np.abs(row[own]))
+        return limits
 
     def apply_laws(self, values: FloatArray | None) -> None:
         """See :class:`~srm_mbs.dynamics.system.System`."""
@@ -380,7 +391,8 @@ class Mechanics(Manifold):
     def _passive_force(self, v: FloatArray) -> FloatArray:
         """Damping and friction, or what acts in place of the laws of the coordinates."""
         if self._applied is None:
-            return self.damping_force(v) + self.friction_force(v)
+            damping = self.damping_force(v)
+            return damping + self.friction_force(v) if self._has_friction else damping
         if self._joined is not None:
             return self._applied
         force = np.zeros(self.nv)
@@ -400,7 +412,8 @@ class Mechanics(Manifold):
 
     def applied_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Controller, joint damping and joint friction (nv,)."""
-        return self.controlled_force(t, q, v) + self._passive_force(v)
+        force = self._passive_force(v)
+        return force if self._controller is None else self.controlled_force(t, q, v) + force
 
     def _forces_at(self, t: float, state: FloatArray) -> FloatArray:
         """All forces (nv,) but those of inertia, gravity and closures."""
@@ -453,8 +466,8 @@ class Mechanics(Manifold):
         return {
             "unit": self._unit,
             "gap_scale": np.zeros(0),
-            "damping": self._damping if self._damping.any() else None,
-            "friction": self._friction if self._friction.any() else None,
+            "damping": self._damping if self._is_damped else None,
+            "friction": self._friction if self._has_friction else None,
         }
 
     def constants_of_model(self) -> dict[str, Any]:
@@ -471,7 +484,7 @@ class Mechanics(Manifold):
             "order": [],
             "pivot_share": PIVOT_SHARE,
             "pivot_window": PIVOT_WINDOW,
-            "friction_speed": float(self._friction_speed),
+            "friction_speed": float(self.friction_speed),
             "forces": [] if self._forces is None else self._forces.constants(),
             "coincident": COINCIDENT,
             "half_turn": np.array([HALF_TURN_ROUNDING, LOCATED_HALF_TURN]),

@@ -39,10 +39,14 @@ def without_spring(force: ForceElement) -> ForceElement:
 def working_elements(mechanism: MechanismData) -> dict[str, ForceKinematics]:
     """The elements that do work beside that of a potential, by name, without their springs."""
     return {
-        force.name: ForceKinematics(mechanism.model, [without_spring(force)])
+        force.name: ForceKinematics(
+            mechanism.model, [without_spring(force)], mechanism.friction_speed
+        )
         for force in mechanism.forces
-        # An undamped spring does no other work.
-        if not force.has_potential or np.any(getattr(force, "damping", 1.0))
+        # A spring without damping and friction does no other work.
+        if not force.has_potential
+        or np.any(getattr(force, "damping", 1.0))
+        or np.any(getattr(force, "friction", 0.0))
     }
 
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
-from srm_mbs._typing import BoolArray, FloatArray
+from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
 from srm_mbs.dynamics.constraints.rheonomic import driven_closures
 from srm_mbs.dynamics.constraints.rows import world_jacobian
@@ -209,30 +210,40 @@ def scene_diagonal(mechanism: MechanismData, q: FloatArray) -> float:
 
 def _diagonal(mechanism: MechanismData, data: pin.Data) -> float:
     """:func:`scene_diagonal` at the placements of ``data``."""
-    model = mechanism.model
-    points = []
-    for joint in range(1, model.njoints):
-        points.append(data.oMi[joint].translation.copy())
-        if model.inertias[joint].mass > 0.0:
-            points.append(data.oMi[joint].act(model.inertias[joint].lever))
-    for joint, point in _anchors(mechanism):
-        points.append(data.oMi[joint].act(point))
-    corners = np.array(points) if points else np.zeros((1, 3))
+    joints, points = _marked_points(mechanism)
+    places = list(data.oMi)
+    rotations = np.array([place.rotation for place in places])[joints]
+    origins = np.array([place.translation for place in places])[joints]
+    corners = origins + (rotations @ points[:, :, None])[:, :, 0]
     diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
-    known_to = RELATIVE_ROUNDING * max(float(np.abs(corners).max()), _gyration(model))
+    farthest = float(np.abs(corners).max())
+    known_to = RELATIVE_ROUNDING * max(farthest, _gyration(mechanism))
     return diagonal if diagonal > known_to else 0.0
 
 
-def _gyration(model: pin.Model) -> float:
+@per_model
+def _gyration(mechanism: MechanismData) -> float:
     """The largest radius of gyration (m) of a body about its centre of mass."""
-    massive = [body for body in model.inertias.tolist() if body.mass > 0.0]
+    massive = [body for body in mechanism.model.inertias.tolist() if body.mass > 0.0]
     # Lumping and shifting may round the trace of a point mass to a negative number.
     squares = [max(np.trace(body.inertia), 0.0) / body.mass for body in massive]
     return float(np.sqrt(max(squares, default=0.0)))
 
 
 @per_model
-def _anchors(mechanism: MechanismData) -> list[tuple[int, FloatArray]]:
+def _marked_points(mechanism: MechanismData) -> tuple[IndexArray, FloatArray]:
+    """Joints (k,) and points (k, 3) in their axes: the joints themselves, centres of mass, and
+    anchors of closures."""
+    bodies = enumerate(islice(mechanism.model.inertias, 1, None), 1)
+    found = [(joint, np.zeros(3)) for joint in range(1, mechanism.model.njoints)]
+    found += [(joint, body.lever) for joint, body in bodies if body.mass > 0.0]
+    found += anchor_points(mechanism)
+    found = found or [(0, np.zeros(3))]
+    return np.array([joint for joint, _ in found]), np.array([point for _, point in found])
+
+
+@per_model
+def anchor_points(mechanism: MechanismData) -> list[tuple[int, FloatArray]]:
     """Joint, and origin (3,) in its axes, of every anchor of a closure."""
     closures = [*mechanism.loops, *driven_closures(mechanism.drives)]
     places = [anchor.resolve(mechanism.model) for loop in closures for anchor in loop.anchors]

@@ -188,6 +188,14 @@ class System(Protocol):
         """Values (m,) of the laws of forces at the stage evaluated last, as
         :meth:`apply_laws` counts them."""
 
+    @property
+    def friction_sums(self) -> FloatArray:
+        """The rates on which friction acts, sums of v with coefficients (n, k)."""
+
+    @property
+    def friction_speed(self) -> float:
+        """Change of such a rate over which friction changes its sign."""
+
     def friction_tolerance(self, v: FloatArray) -> FloatArray:
         """Errors (n,) of a tangent from which the friction at the rates ``v`` (k,) is another;
         infinite where there is none."""

@@ -32,7 +32,8 @@ from srm_mbs.errors import (
 from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.plausibility import doubtful_angles, doubtful_inertias
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
-from srm_mbs.formats.urdf.parser import build_urdf, lock_joints
+from srm_mbs.formats.urdf.parser import UrdfModel, build_urdf, lock_joints
+from srm_mbs.formats.variants import Elements
 from srm_mbs.formats.xml import parse_xml
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.coordinates import write_position, write_rate
@@ -161,8 +162,10 @@ def _with_massless_ends(
     )
 
 
-def _friction_note(model: pin.Model, friction_speed: float) -> tuple[str, ...]:
-    if not model.friction.any():
+def _friction_note(
+    model: pin.Model, forces: tuple[ForceElement, ...], friction_speed: float
+) -> tuple[str, ...]:
+    if not model.friction.any() and not any(getattr(force, "friction", 0.0) for force in forces):
         return ()
     return (
         "joint friction F acts as F tanh(v/v_s) with v_s = "
@@ -192,6 +195,10 @@ class Reading:
         Reads it again with other values of its parameters; None without parameters.
     analysis
         That of another variant of the description, if it is one.
+    shape, model
+        As of :class:`~srm_mbs.formats.translation.Translation`.
+    elements
+        Its elements, where they are not made from the tables of the description.
     """
 
     description: Description
@@ -203,6 +210,9 @@ class Reading:
     kind: type[Mechanism] = Mechanism
     variants: VariantMaker | None = None
     analysis: ReusableAnalysis | None = None
+    shape: tuple[Any, ...] = ()
+    model: pin.Model | None = None
+    elements: Elements | None = None
 
 
 def unassembled(
@@ -218,15 +228,19 @@ def unassembled(
         Naming file, element and remedy.
     """
     description, source = reading.description, reading.source
-    built = build_urdf(
-        reading.tree, source.urdf_path, source.base, description.lock, description.coupled_joints()
-    )
+    if reading.model is not None:
+        built = UrdfModel(reading.model, ())
+    else:
+        locked, coupled = description.lock, description.coupled_joints()
+        built = build_urdf(reading.tree, source.urdf_path, source.base, locked, coupled)
     built.model.gravity.linear = np.array(source.gravity)
     description, massless = _with_massless_ends(description, built.model)
     _check_joint_names(description, built.model)
     model, q, v, guess = _without_locked(description, built.model)
     check_inertia(model, source.urdf_path)
-    _check_frames(description, model)
+    elements = reading.elements
+    if elements is None:
+        _check_frames(description, model)
     start = pin.neutral(model)
     for where, values in (("initial.guess", guess), ("initial.q", q)):
         for name, value in values.items():
@@ -239,14 +253,15 @@ def unassembled(
     csv = CsvFolder(Path(source.path).parent, source.reach) if tables else None
     friction_speed = description.friction_speed
     actuators, idle = description.named_actuators()
+    forces = (
+        *description.force_elements(csv),
+        *_compensation(reading, model, np.array(source.gravity)),
+    )
     mechanism = reading.kind(
         model,
-        description.closures(),
+        description.closures() if elements is None else elements.closures,
         q0=start,
-        forces=(
-            *description.force_elements(csv),
-            *_compensation(reading, model, np.array(source.gravity)),
-        ),
+        forces=forces,
         drives=description.drives(csv) if csv else (),
         friction_speed=friction_speed,
         name=description.name or model.name,
@@ -257,9 +272,9 @@ def unassembled(
             *built.notes,
             *massless,
             *idle,
-            *_friction_note(model, friction_speed),
+            *_friction_note(model, forces, friction_speed),
         ),
-        points=description.named_points(),
+        points=description.named_points() if elements is None else elements.points,
         actuators=actuators,
     )
     if description.limits == "spring":
@@ -335,18 +350,20 @@ ROTOR_INERTIA = 1e-9
 less than tolerances show, and enough for accelerations to be above rounding."""
 
 
-def _with_rotors(mechanism: Mechanism) -> Mechanism:
-    """The mechanism with rotors on damped joints that move no inertia at the start, and a note.
+def _with_rotors(mechanism: Mechanism) -> tuple[Mechanism, int | None]:
+    """The mechanism with rotors on damped joints that move no inertia at the start, and a note; and
+    a joint that moves none still, if there is one.
 
     Damping d alone determines the motion along such a direction, as for d -> 0 of the inertia.
     """
     model, source = mechanism.model, mechanism.source
     armature = np.array(model.armature)
+    path = None if source is None else source.urdf_path
     names: list[str] = []
+    at: int | None = None
     for _ in range(model.njoints):
-        path = None if source is None else source.urdf_path
         at = undetermined_joint(model, mechanism.q0, path, ROTOR_INERTIA)
-        if at is None:
+        if at is None:  # then none moves less, either
             break
         own = slice(model.idx_vs[at], model.idx_vs[at] + model.nvs[at])
         if not model.damping[own].all():
@@ -357,14 +374,16 @@ def _with_rotors(mechanism: Mechanism) -> Mechanism:
         composite = np.diag(pin.crba(model, workspace(model), mechanism.q0))
         armature[own] += 2.0 * ROTOR_INERTIA * composite[own]
         model.armature = armature
+    if at is not None:
+        at = undetermined_joint(model, mechanism.q0, path)
     if not names:
-        return mechanism
+        return mechanism, at
     note = (
         f"the inertia that {', '.join(map(repr, names))} moves vanishes in one direction at the "
         f"start: damping determines the motion there, and a rotor of {2.0 * ROTOR_INERTIA:g} of "
         "what the joint carries is added; give the links at its end a moment of inertia"
     )
-    return replace(mechanism, model=model, notes=(*mechanism.notes, note))
+    return replace(mechanism, model=model, notes=(*mechanism.notes, note)), at
 
 
 ALMOST_CLOSED = 1e-5
@@ -425,7 +444,8 @@ def assembled(reading: Reading) -> Mechanism:
         As :func:`srm_mbs.load`.
     """
     description, source = reading.description, reading.source
-    description.refuse_identical_closures()
+    if reading.elements is None:
+        description.refuse_identical_closures()
     mechanism, q, v = unassembled(reading)
     try:
         if description.closing_tolerance:
@@ -433,8 +453,7 @@ def assembled(reading: Reading) -> Mechanism:
             if note:
                 mechanism = replace(reduced, notes=(*reduced.notes, note))
         # The mass matrix has to be regular before the analysis factorises it.
-        mechanism = _with_rotors(consistent_start(mechanism, q, v).mechanism)
-        joint = undetermined_joint(mechanism.model, mechanism.q0, source.urdf_path)
+        mechanism, joint = _with_rotors(consistent_start(mechanism, q, v).mechanism)
         if joint is None:
             _analysed(mechanism, reading.analysis)
     except AssemblyError as error:

@@ -22,9 +22,10 @@ from srm_mbs.formats.document import Document
 from srm_mbs.formats.registry import DESCRIPTION, LINKAGE, Format, find_format, of_key
 from srm_mbs.formats.toml.description import Description, check_description
 from srm_mbs.formats.toml.parameters import given_parameters, resolved
-from srm_mbs.formats.translation import Options, merged
+from srm_mbs.formats.translation import KnownTree, Options, merged
 from srm_mbs.formats.urdf.override import override, without_overrides
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
+from srm_mbs.formats.variants import KnownLinkage
 from srm_mbs.model.mechanism import Source, SourceTexts, variant_maker
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array, name_list
 from srm_mbs.model.reach import Reach
@@ -109,6 +110,7 @@ def _translated(
     model: Document,
     overrides: Overrides,
     reach: Reach,
+    known: KnownLinkage | None = None,
 ) -> Reading:
     """Translate ``model``, the file that the description names, and merge the two."""
     keyframe = overrides.keyframe
@@ -120,7 +122,8 @@ def _translated(
         )
     cut = overrides.cut or tuple(description.cut)
     base = None if overrides.base is None else _checked_base(overrides.base)
-    options = Options(cut, entries, reach, keyframe, base, description.planar)
+    tree = None if known is None else known.tree
+    options = Options(cut, entries, reach, keyframe, base, description.planar, tree)
     translation = found.translate(model, options)
     given, as_read = overrides.entries(), bool(own.text)
     if description.override:
@@ -138,7 +141,12 @@ def _translated(
         urdf_name = Path(model.file).with_suffix(".urdf").name
         entries = merged(entries, translation.entries, urdf_name)
         as_read = False
-    if given or not as_read:
+    elements = None
+    if known is not None and translation.model is not None and not given:
+        elements = known.elements(entries)
+    if elements is not None:
+        description = elements.description
+    elif given or not as_read:
         entries = {**entries, **given}
         description = check_description(entries, own.file)
         as_read = False
@@ -155,18 +163,32 @@ def _translated(
     )
     log.debug("%s: read as %s", model.file, found.name)
     notes = (*model.notes, *translation.notes)
-    return Reading(description, entries, translation.tree, source, notes, translation.check)
+    return Reading(
+        description,
+        entries,
+        translation.tree,
+        source,
+        notes,
+        translation.check,
+        shape=translation.shape,
+        model=translation.model,
+        elements=elements,
+    )
 
 
 def _of_description(
-    own: Document, overrides: Overrides, reach: Reach, urdf: str | None = None
+    own: Document,
+    overrides: Overrides,
+    reach: Reach,
+    urdf: str | None = None,
+    known: KnownLinkage | None = None,
 ) -> Reading:
     """Read a description; its model file is read from disk unless ``urdf`` is its text."""
     entries, values, notes = resolved(own.toml, overrides.parameters, own.file)
     given = own
     own = own if entries is own.toml else Document("", own.file)
     description = check_description(entries, own.file)
-    reading, model = _of_tables(own, entries, description, overrides, reach, urdf)
+    reading, model = _of_tables(own, entries, description, overrides, reach, urdf, known)
     return replace(
         reading,
         source=replace(reading.source, parameters=values),
@@ -179,8 +201,9 @@ def _of_description(
 class _Variants:
     """A description with parameters, and the text of its model file if it names one.
 
-    ``analysis`` is that of the mechanism that was loaded first: all variants are compared with it,
-    so that they do not depend on the order in which they are made.  ``kind`` is their class.
+    ``analysis`` and ``known`` are those of the mechanism that was loaded first: all variants are
+    compared with it, so that they do not depend on the order in which they are made.  ``kind`` is
+    their class.
     """
 
     own: Document
@@ -189,6 +212,7 @@ class _Variants:
     model: str | None
     kind: type[Mechanism] = Mechanism
     analysis: ReusableAnalysis | None = None
+    known: KnownLinkage | None = None
 
     @property
     def definition(self) -> tuple[Any, ...]:
@@ -198,7 +222,7 @@ class _Variants:
         values = {**self.overrides.parameters, **given_parameters(parameters)}
         with naming(file=self.own.file):
             overrides = replace(self.overrides, parameters=values)
-            reading = _of_description(self.own, overrides, self.reach, self.model)
+            reading = _of_description(self.own, overrides, self.reach, self.model, self.known)
             mechanism = assembled(replace(reading, analysis=self.analysis, kind=self.kind))
         variant_maker.keep(mechanism, replace(self, overrides=overrides))
         return mechanism
@@ -211,11 +235,13 @@ def _of_tables(
     overrides: Overrides,
     reach: Reach,
     urdf: str | None,
+    known: KnownLinkage | None,
 ) -> tuple[Reading, str | None]:
     """Read what a description, whose tables are checked, consists of or names; with the text of its
     model file."""
     if description.planar is not None:
-        return _translated(own, entries, description, LINKAGE, own, overrides, reach), None
+        read = _translated(own, entries, description, LINKAGE, own, overrides, reach, known)
+        return read, None
     key, name = description.model_file
     path = Path(own.file).parent / name
     if urdf is not None:
@@ -249,10 +275,25 @@ def mechanism_of(reading: Reading) -> Mechanism:
     with naming(file=reading.source.path):
         mechanism = assembled(reading)
     if isinstance(reading.variants, _Variants):
-        analysis = ReusableAnalysis.of(mechanism)
-        variants = replace(reading.variants, analysis=analysis, kind=reading.kind)
+        variants = replace(
+            reading.variants,
+            analysis=ReusableAnalysis.of(mechanism),
+            known=_known_linkage(reading, mechanism),
+            kind=reading.kind,
+        )
         variant_maker.keep(mechanism, variants)
     return mechanism
+
+
+def _known_linkage(reading: Reading, mechanism: Mechanism) -> KnownLinkage | None:
+    """A mechanism for its variants; None where more than its numbers made its tree, or where its
+    variants need the URDF itself."""
+    description, model = reading.description, mechanism.model
+    changed = description.lock or description.massless != "refused" or model.armature.any()
+    if not reading.shape or changed or description.gravity_compensation:
+        return None
+    tree = KnownTree(reading.shape, model)
+    return KnownLinkage(tree, description, reading.entries, description.closures())
 
 
 def _of_file(path: Path, overrides: Overrides) -> Reading:

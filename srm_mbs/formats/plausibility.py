@@ -9,7 +9,7 @@ from typing import Any
 import pinocchio as pin
 
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.scaling import is_angle, scene_diagonal
+from srm_mbs.dynamics.scaling import anchor_points, is_angle, scene_diagonal
 
 LARGEST_START = 4.0 * math.pi
 """Angle (rad) of a start above which it may be in degrees."""
@@ -41,12 +41,11 @@ def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:
     model = mechanism.model
     scene = scene_diagonal(mechanism, mechanism.q0)
     sizes = [0.0] * model.njoints
-    ends = [
-        (model.parents[joint], model.jointPlacements[joint]) for joint in range(1, model.njoints)
-    ]
-    ends += [anchor.resolve(model) for loop in mechanism.loops for anchor in loop.anchors]
+    parents, places = list(model.parents), list(model.jointPlacements)
+    ends = [(parents[joint], places[joint].translation) for joint in range(1, model.njoints)]
+    ends += anchor_points(mechanism)
     for joint, place in ends:
-        sizes[joint] = max(sizes[joint], math.hypot(*place.translation.tolist()))
+        sizes[joint] = max(sizes[joint], math.hypot(*place.tolist()))
     for joint in range(1, model.njoints):
         body = model.inertias[joint]
         half_trace = 0.5 * max(sum(body.inertia.diagonal().tolist()), 0.0)

@@ -12,6 +12,8 @@ from functools import partial
 from typing import Any
 from xml.etree.ElementTree import Element, indent, tostring
 
+import pinocchio as pin
+
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.formats.toml.schema import PlanarEntry
 from srm_mbs.model.reach import Reach
@@ -35,6 +37,8 @@ class Options:
         How the root link is held; None: as the description or the file says.
     planar
         The checked section ``[planar]`` of the description, if it has one.
+    known
+        The tree of another variant of the description.
     """
 
     cut: tuple[str, ...] = ()
@@ -43,6 +47,23 @@ class Options:
     keyframe: str | None = None
     base: str | None = None
     planar: PlanarEntry | None = None
+    known: KnownTree | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class KnownTree:
+    """The tree of a mechanism, whose variants may have the same links and joints.
+
+    Attributes
+    ----------
+    shape
+        All of it but the numbers that variants change (:attr:`Translation.shape`).
+    model
+        Pinocchio's model.
+    """
+
+    shape: tuple[Any, ...]
+    model: pin.Model
 
 
 def urdf_text(tree: Element) -> str:
@@ -72,6 +93,11 @@ class Translation:
         The file that the URDF came from, if it is another one than that translated.
     check
         Raises InputError if the assembled mechanism cannot be what the file is meant to describe.
+    shape
+        All of the tree but the numbers that variants change, for :class:`KnownTree`; empty where
+        variants are built from their tree.
+    model
+        Pinocchio's model, if it was made from that of a :class:`KnownTree`: ``tree`` is empty.
     """
 
     tree: Element
@@ -80,6 +106,8 @@ class Translation:
     notes: tuple[str, ...] = ()
     urdf_file: str = ""
     check: Callable[[Mechanism], None] | None = None
+    shape: tuple[Any, ...] = ()
+    model: pin.Model | None = None
 
     def __post_init__(self) -> None:
         if self.write is None:  # building the mechanism changes the tree

@@ -1,4 +1,4 @@
-r"""Where a joint with friction turns back: steps end beside the layer of rates they do not resolve.
+r"""Where a rate with friction turns back: steps end beside the layer of rates they do not resolve.
 
 Friction -F tanh(v / v_s) changes its sign within a few v_s.  Stages on both sides of that layer see
 a jump of the acceleration, of which an embedded pair, which takes the motion for smooth, finds a
@@ -28,7 +28,7 @@ UNRESOLVED = 4.0
 
 
 class ReversalSearch:
-    """Looks for joints with friction that turn back in a step.
+    """Looks for rates with friction, of joints and sums of joints, that turn back in a step.
 
     Parameters
     ----------
@@ -38,27 +38,21 @@ class ReversalSearch:
 
     def __init__(self, system: System, norm: ErrorNorm) -> None:
         self._norm = norm
-        k = system.multiplier_part.start
-        self._speeds = system.friction_tolerance(np.zeros(k))[k:]
-        self._rubs = np.flatnonzero(np.isfinite(self._speeds))
-        self._k = k
+        self._k = system.multiplier_part.start
+        self._sums, self._layer = system.friction_sums, LAYER * system.friction_speed
 
     def late(self, memory: IntegratorState, result: StepResult) -> float:
         """Time (s) by which the step ``result`` from ``memory`` leads too far over a layer: 0 where
         it ends beside that, negative before it, -infinity where nothing turns back."""
-        if not self._rubs.size:
+        k, sums = self._k, self._sums
+        if not len(sums):
             return -np.inf
-        weights = self._norm.weights(np.maximum(memory.state_scale, result.state_scale))
+        weights = self._norm.weights(np.maximum(memory.state_scale, result.state_scale))[k:]
+        ends = sums @ memory.rate[:k], sums @ result.end_rate[:k], np.abs(sums) @ weights
+        at = sums @ result.rates[:-1, :k].T
         return max(
-            late_past_layer(
-                result.h,
-                float(memory.rate[i]),
-                float(result.end_rate[i]),
-                result.rates[:-1, i],
-                LAYER * float(self._speeds[i]),
-                float(weights[self._k + i]),
-            )
-            for i in self._rubs.tolist()
+            late_past_layer(result.h, before, after, stages, self._layer, tolerance)
+            for before, after, tolerance, stages in zip(*(each.tolist() for each in ends), at)
         )
 
 

@@ -12,6 +12,7 @@ import pinocchio as pin
 from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.model.numbers import vector
 
+_UNTURNED = np.eye(3)
 WORLD = "world"
 """Reserved link name: the fixed ground."""
 
@@ -67,15 +68,17 @@ class Anchor:
         InputError
             If the model has no such link or frame; the message lists those it has.
         """
-        offset = pin.SE3(pin.rpy.rpyToMatrix(np.array(self.rpy)), np.array(self.xyz))
+        rotation = pin.rpy.rpyToMatrix(np.array(self.rpy)) if any(self.rpy) else _UNTURNED
+        offset = pin.SE3(rotation, np.array(self.xyz))
         if self.link == WORLD:
             return 0, offset
-        body = pin.FrameType.BODY
+        body, missing = pin.FrameType.BODY, model.nframes
         if self.link is not None:
-            index = model.getFrameId(self.link, body) if model.existFrame(self.link, body) else -1
+            index = model.getFrameId(self.link, body)
         else:
-            index = next((i for i, f in enumerate(model.frames) if f.name == self.frame), -1)
-        if index < 0:
+            frames = enumerate(model.frames)
+            index = next((i for i, frame in frames if frame.name == self.frame), missing)
+        if index == missing:
             kind = "link" if self.link is not None else "frame"
             names = {f.name for f in model.frames if kind == "frame" or f.type == body}
             names = names - {"universe"} | {WORLD}

@@ -390,6 +390,13 @@ class LoopClosure:
             self._take_joints(self.joints)
         self._take_without()
 
+    def between(self, a: Anchor, b: Anchor) -> LoopClosure:
+        """The same closure between other places."""
+        out = object.__new__(type(self))  # all else has been checked
+        own = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        out.__dict__.update(own, a=a, b=b)
+        return out
+
     @property
     def _element(self) -> str:
         """Its name in messages."""

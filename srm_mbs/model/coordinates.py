@@ -117,7 +117,9 @@ def joint_coordinates(mechanism: MechanismData, names: Iterable[str]) -> IndexAr
 
 def free_coordinates(mechanism: MechanismData, held: Iterable[str]) -> IndexArray:
     """Velocity indices of the joints that are not held."""
-    return np.setdiff1d(np.arange(mechanism.model.nv), joint_coordinates(mechanism, set(held)))
+    free = np.ones(mechanism.model.nv, dtype=bool)
+    free[joint_coordinates(mechanism, set(held))] = False
+    return np.flatnonzero(free)
 
 
 def position_of(mechanism: MechanismData, q: FloatArray, name: str) -> float:

@@ -121,8 +121,10 @@ class ForceElement(ABC):
     def _refuse_zeros(self, *keys: str) -> None:
         """Refuse an element without effect: all its quantities ``keys`` are zero."""
         if not any(np.any(getattr(self, key)) for key in keys if getattr(self, key) is not None):
+            *others, last = keys
             raise self._fault(
-                f"{' and '.join(keys)} are zero", "Give one of them, or remove the element"
+                f"{', '.join(others)} and {last} are zero",
+                "Give one of them, or remove the element",
             )
 
     def _take_law(self, count: int) -> tuple[Law, ...]:
@@ -205,7 +207,8 @@ class _BetweenLinks(ForceElement):
 class SpringDamper(_BetweenLinks):
     """Spring and damper between two points, along the line that joins them.
 
-    With the distance l of the points it pulls them together with F = k (l - l0) + c dl/dt.
+    With the distance l of the points it pulls them together with F = k (l - l0) + c dl/dt; with a
+    slack s the spring has no force while l is between l0 and l0 + s, and F = k (l - l0 - s) beyond.
 
     Parameters
     ----------
@@ -217,6 +220,8 @@ class SpringDamper(_BetweenLinks):
         l0 in m; needed where there is stiffness.
     name
         Unique name.
+    slack
+        s in m, not negative; a rope that is s long has l0 = 0.
 
     Raises
     ------
@@ -227,6 +232,8 @@ class SpringDamper(_BetweenLinks):
     -----
     Where the points coincide the line has no direction.  If l0 = 0 the force is continuous there in
     any motion and acts; otherwise that state cannot be evaluated, and a run that meets it says so.
+    At the ends of the slack the force is continuous and its slope is not: a step across them is as
+    short as its error estimate asks.
     """
 
     type: ClassVar[str] = "spring_damper"
@@ -234,6 +241,7 @@ class SpringDamper(_BetweenLinks):
     damping: float = quantity("N s/m", 0.0, nonnegative=True)
     rest_length: float | None = quantity("m", None, nonnegative=True)
     name: str = ""
+    slack: float = quantity("m", 0.0, nonnegative=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -337,9 +345,12 @@ class TorsionSpring(ForceElement):
 
 @dataclass(frozen=True)
 class CouplingSpring(ForceElement):
-    """Spring and damper on a sum of joint coordinates, as a cable over several joints has it.
+    """Spring, damper and friction on a sum of joint coordinates, as a cable over several joints has
+    them.
 
-    With y = sum c_i q_i, the joint i has the force tau_i = -c_i (k (y - y_0) + c dy/dt).
+    With y = sum c_i q_i, the joint i has the force
+    tau_i = -c_i (k d + c dy/dt + F tanh((dy/dt) / v_s)).  The stretch d is y - y_0; with a slack s
+    it is 0 from y_0 to y_0 + s, and beyond the distance from there.
 
     Parameters
     ----------
@@ -353,6 +364,11 @@ class CouplingSpring(ForceElement):
         y_0 in the unit of y.
     name
         Unique name.
+    slack
+        s, not negative, in the unit of y.
+    friction
+        F, not negative: the force on y of dry friction, which changes its sign smoothly over the
+        ``friction_speed`` v_s of the mechanism, in the unit of y over s.
 
     Raises
     ------
@@ -368,6 +384,8 @@ class CouplingSpring(ForceElement):
     damping: float = quantity("", 0.0, nonnegative=True)
     rest: float = quantity("", 0.0)
     name: str = ""
+    slack: float = quantity("", 0.0, nonnegative=True)
+    friction: float = quantity("", 0.0, nonnegative=True)
 
     def __post_init__(self) -> None:
         joints = (self.joints,) if isinstance(self.joints, str) else self.joints
@@ -395,7 +413,7 @@ class CouplingSpring(ForceElement):
             raise self._fault("a coefficient is zero", "Remove that joint from the list")
         self._set("coefficients", numbers)
         self._take_quantities()
-        self._refuse_zeros("stiffness", "damping")
+        self._refuse_zeros("stiffness", "damping", "friction")
 
     def check(self, model: pin.Model) -> None:
         for name in self.joints:

@@ -370,8 +370,8 @@ class MechanismData(ResultOwner):
     def _at_no_start(self) -> Self:
         """A copy that shares the results for the model and has none for the start."""
         changed = object.__new__(type(self))
-        # All that a frozen dataclass without slots holds.
-        changed.__dict__.update(self.__dict__)
+        for name, value in vars(self).items():
+            object.__setattr__(changed, name, value)
         object.__setattr__(changed, "_start_results", {})
         return changed
 

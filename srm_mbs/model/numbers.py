@@ -41,7 +41,9 @@ def finite_array(
         len(shape) == array.ndim
         and all(length in (None, actual) for length, actual in zip(shape, array.shape))
     )
-    return array if fits and np.isfinite(array).all() else None
+    if not fits or not np.logical_and.reduce(np.isfinite(array), axis=None):
+        return None
+    return array
 
 
 def flag(value: Any, name: str) -> bool:
@@ -194,6 +196,10 @@ def vector(values: Any, name: str, element: str | None = None) -> tuple[float, f
     InputError
         About ``element``, by default ``name``, if they are anything else.
     """
+    if type(values) in (tuple, list) and len(values) == 3:
+        x, y, z = values
+        if type(x) is type(y) is type(z) is float and math.isfinite(x + y + z):
+            return (x, y, z)
     x, y, z = finite_numbers(values, 3, name, "Give [x, y, z]", element)
     return (x, y, z)
 

@@ -71,13 +71,19 @@ def check_inertia(model: pin.Model, file: str | None = None) -> None:
 
 
 def massless_ends(model: pin.Model) -> list[int]:
-    """The joints that move neither mass nor inertia, from the root to the tips."""
-    moved = np.zeros((model.njoints, 2))
+    """The joints that move neither mass, inertia nor armature of their own, from the root to the
+    tips."""
+    parents, moves = list(model.parents), [False] * model.njoints
     for joint in range(model.njoints - 1, 0, -1):
         inertia = model.inertias[joint]
-        moved[joint] += inertia.mass, np.trace(inertia.inertia)
-        moved[model.parents[joint]] += moved[joint]
-    return [joint for joint in range(1, model.njoints) if not moved[joint].any()]
+        if moves[joint] or inertia.mass or inertia.inertia.trace():
+            moves[joint] = moves[parents[joint]] = True
+    return [
+        joint
+        for joint in range(1, model.njoints)
+        if not moves[joint]
+        and not model.armature[model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]].all()
+    ]
 
 
 def undetermined_joint(
@@ -100,11 +106,12 @@ def undetermined_joint(
         If the mass matrix is not finite.
     """
     with np.errstate(all="ignore"):
-        M = pin.crba(model, workspace(model), q)
-        M = (np.triu(M) + np.triu(M, 1).T)[::-1, ::-1]
-        size = np.sqrt(np.diag(M))
+        # Of M the upper triangle counts: the lower one of what LAPACK reads.
+        data = workspace(model)
+        M = pin.crba(model, data, q)[::-1, ::-1]
+        size = np.sqrt(M.diagonal())
         scaled = M / size[:, None] / size
-    if not np.isfinite(M).all():
+    if not np.isfinite(np.tril(M)).all():
         raise InputError(
             "the mass matrix is not finite",
             file=file,
@@ -115,7 +122,7 @@ def undetermined_joint(
         failed = int(bad[0])
     else:
         factor, info = dpotrf(scaled, lower=1)
-        small = np.flatnonzero(np.diag(factor)[: info - 1 if info else None] ** 2 < least)
+        small = np.flatnonzero(factor.diagonal()[: info - 1 if info else None] ** 2 < least)
         if not small.size and not info:
             return None
         failed = int(small[0]) if small.size else info - 1
@@ -147,21 +154,26 @@ def check_tree(model: pin.Model) -> None:
                 element=f"model.{what}",
                 remedy="Give finite numbers",
             )
-    for name, joint in zip(list(model.names)[1:], list(model.joints)[1:]):
-        damping = model.damping[joint.idx_v : joint.idx_v + joint.nv]
-        if (damping < 0.0).any():
-            raise InputError(
-                f"the damping of the joint {safe_repr(name)} is negative: {damping}",
-                element="model.damping",
-                remedy="Give no negative numbers; a force that feeds energy in is an srm.UserForce",
-            )
+    negative = np.flatnonzero(model.damping < 0.0)
+    if negative.size:
+        at = int(np.searchsorted(model.idx_vs, negative[0], side="right")) - 1
+        damping = model.damping[model.idx_vs[at] : model.idx_vs[at] + model.nvs[at]]
+        raise InputError(
+            f"the damping of the joint {safe_repr(model.names[at])} is negative: {damping}",
+            element="model.damping",
+            remedy="Give no negative numbers; a force that feeds energy in is an srm.UserForce",
+        )
     _check_order(model)
 
 
 def _check_order(model: pin.Model) -> None:
     """Refuse joints out of order: Pinocchio's crba would return a wrong mass matrix, silently."""
-    for joint in range(2, model.njoints):
-        if model.parents[joint] not in list(model.supports[joint - 1]):
+    parents, branch = list(model.parents), [0]
+    for joint in range(1, model.njoints):
+        while branch and branch[-1] != parents[joint]:
+            branch.pop()
+        branch.append(joint)
+        if len(branch) < 2:
             raise InputError(
                 f"the joint {model.names[joint]!r} continues a branch that another joint, "
                 f"{model.names[joint - 1]!r}, has interrupted",

@@ -243,20 +243,20 @@ class KernelRun(IncrementalRun):
             reason = run.advance()
         if reason is not ReturnReason.FINISHED:
             failure = why_stopped(reason, self.system, run)
-            raise self._stopped(f" with step {run.h:.1e} s", failure.sentence)
+            raise self._stopped(f" with step {self._core.h:.1e} s", failure.sentence)
 
     def go_on_from(self, other: Self) -> None:
-        snapshot = other._run.snapshot()
+        snapshot = other._core.snapshot()
         self._hold(snapshot.t, other.held.values[-1])
-        self._run.restore(snapshot)
+        self._core.restore(snapshot)
 
     @property
     def last_steps(self) -> int:
         return self._core.count  # type: ignore[no-any-return]
 
     def _counts(self) -> tuple[int, int, int, int, int]:
-        steps, rejected, zones = self._run.totals()
-        return steps, rejected, self._run.placed, self._run.replaced, zones
+        steps, rejected, zones = self._core.totals()
+        return steps, rejected, self._core.placed, self._core.replaced, zones
 
 
 class ReferenceRun(IncrementalRun):

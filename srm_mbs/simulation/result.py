@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,9 +169,14 @@ class RunData(Protocol):
     steps, dense
         The accepted steps and their dense output; None of a run with output times that did not
         keep them.
+    nodes
+        Times (n + 1,) s and states (n + 1, nx) at the ends of the steps, as
+        :meth:`~srm_mbs.integration.dense_output.DenseOutput.nodes`, of a run that has them.
     output, again
         Of such a run, its output, and a function that makes it again; None otherwise, and if it
         cannot be made again.
+    backend
+        What made the run, as in its settings.
     bifurcations
         As in :class:`SimulationResult`; None where they have not been looked for.
     attempts, message, stats, settings
@@ -182,6 +187,8 @@ class RunData(Protocol):
     def steps(self) -> StepData | None: ...
     @property
     def dense(self) -> DenseOutput | None: ...
+    @property
+    def nodes(self) -> tuple[FloatArray, FloatArray]: ...
     @property
     def output(self) -> StreamedOutput | None: ...
     @property
@@ -196,6 +203,8 @@ class RunData(Protocol):
     def stats(self) -> Statistics: ...
     @property
     def settings(self) -> Settings: ...
+    @property
+    def backend(self) -> str: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,6 +220,14 @@ class KnownRunData:
     output: StreamedOutput | None = None
     again: Callable[[], SimulationResult] | None = None
     bifurcations: tuple[Bifurcation, ...] | None = None
+
+    @property
+    def nodes(self) -> tuple[FloatArray, FloatArray]:
+        return cast(DenseOutput, self.dense).nodes()
+
+    @property
+    def backend(self) -> str:
+        return self.settings.backend
 
 
 class SimulationResult(RunOutcome):
@@ -291,7 +308,7 @@ class SimulationResult(RunOutcome):
         if self.t_eval is not None:
             t = self.t_eval[self.t_eval <= self.steps.end]
             return t, self._dense(t)
-        t, states = self._dense.nodes()
+        t, states = self._whole.nodes
         # q and v are views: writing to them would change the dense output.
         states.setflags(write=False)
         t.setflags(write=False)
@@ -382,7 +399,8 @@ class SimulationResult(RunOutcome):
     @cached_property
     def observables(self) -> Observables:
         """Quantities at many states of the mechanism, by the backend of the run."""
-        by_kernel = self.settings.backend in COMPILED and core is not None
+        by = self.__dict__["settings"].backend if "settings" in self.__dict__ else self._run.backend
+        by_kernel = by in COMPILED and core is not None
         return (CompiledObservables if by_kernel else Observables)(self._system)
 
     @property

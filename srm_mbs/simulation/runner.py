@@ -112,6 +112,12 @@ SMALLER_STEPS = "See solution.crossings; try a smaller rtol or step."
 """Remedy for a passage that may have changed the branch."""
 KEPT_NORMS = 16
 """Error norms that a mechanism keeps at most."""
+KEPT_OPTIONS = 64
+"""Checked options that are kept at most."""
+_PLAIN = frozenset((float, int, bool, str, tuple, type(None)))
+"""Types of options that are known by their value."""
+_known_options: dict[tuple[bool, tuple[Any, ...], tuple[type, ...]], RunOptions] = {}
+"""Checked options, by those of the user."""
 
 Result = TypeVar("Result", bound=SimulationResult)
 Outcome = TypeVar("Outcome", bound=RunOutcome)
@@ -212,7 +218,7 @@ def lead_with_cause(problem: Problem, record: RunRecord) -> None:
     """Let the message of a run whose steps failed begin with the cause, if it is found."""
     if record.status is not RunStatus.FAILED or record.error is not None:
         return
-    state = record.run.state if isinstance(record, CompiledRecord) else record.last_state
+    state = record.run.core.state if isinstance(record, CompiledRecord) else record.last_state
     cause = failure_cause(problem.mechanism, *problem.system.split(state), problem.held_watch)
     if cause is not None:
         record.lead_with(cause)
@@ -265,6 +271,25 @@ def checked_options(mechanism: Any, options: RunOptions) -> RunOptions:
         For the first that is invalid.
     """
     check_mechanism(mechanism)
+    # Most runs of a loop have the same options, of which those without functions and arrays are
+    # known by their values and types: 1 is no truth value, and True no number.
+    others = options[:2] + options[4:]  # without the start, which is checked elsewhere
+    types = tuple(map(type, others))
+    plain = _PLAIN.issuperset(types) and not (options.breakpoints or options.singular_times)
+    key = (mechanism.constrained, others, types) if plain else None
+    known = None if key is None else _known_options.get(key)
+    if known is not None:
+        q0, v0 = options.q0, options.v0
+        return known if q0 is None and v0 is None else known._replace(q0=q0, v0=v0)
+    checked = _checked_anew(mechanism, options)
+    if key is not None and checked.rtol == options.rtol:  # others warn each time
+        if len(_known_options) >= KEPT_OPTIONS:
+            _known_options.clear()
+        _known_options[key] = checked._replace(q0=None, v0=None)
+    return checked
+
+
+def _checked_anew(mechanism: Mechanism, options: RunOptions) -> RunOptions:
     t0, t_end = checked_span(options.t0, options.t_end)
     if options.controller is not None and not callable(options.controller):
         raise InputError(
@@ -399,8 +424,8 @@ def _check_errors(mechanism: Mechanism, t: float, observables: CompiledObservabl
     speed = max(units.rate, float(np.abs(v0 / units.coordinate).max()))
     for what, values, limit in (("q0", g, CONSISTENT), ("v0", c, CONSISTENT * speed)):
         errors = np.abs(values) / unit
-        worst = int(errors.argmax())
-        if errors[worst] > limit:
+        if np.logical_or.reduce(errors > limit):
+            worst = int(errors.argmax())
             kind = "drives" if worst >= len(g) - len(mechanism.drives) else "closures"
             raise InputError(
                 f"the initial state violates the {kind}: row "
@@ -786,7 +811,7 @@ class FinishedRun:
         self._system, options = problem.system, problem.options
         self._mechanism, self._norm = problem.mechanism, problem.norm
         self._options = options if options.progress is False else options._replace(progress=False)
-        self._backend, self._passages = problem.backend, problem.passages
+        self.backend, self._passages = problem.backend, problem.passages
         self._kernel_system = None if shared(problem.system) else kernel_system
         self._record, self._counters = record, counters
         # Before anything reads the dense output, which evaluates stages.
@@ -800,7 +825,7 @@ class FinishedRun:
             if isinstance(kept, StreamedOutput):
                 self.steps, self.output = None, kept
                 if not self._controlled:
-                    repeated = self._options._replace(t_eval=None, backend=self._backend)
+                    repeated = self._options._replace(t_eval=None, backend=self.backend)
                     self.again = partial(run_segment, self._mechanism, repeated, result_type)
             else:
                 self.steps = kept
@@ -817,6 +842,15 @@ class FinishedRun:
         return self._record.data(self._options.method.scheme, self._system.tangent_size)
 
     @cached_property
+    def nodes(self) -> tuple[FloatArray, FloatArray]:
+        record = self._record
+        if isinstance(record, CompiledRecord) and record.stop is None:
+            found = record.nodes()
+            if found is not None:
+                return found
+        return cast(DenseOutput, self.dense).nodes()
+
+    @cached_property
     def dense(self) -> DenseOutput | None:
         if self.steps is None:
             return None
@@ -824,7 +858,7 @@ class FinishedRun:
         # The dense output of a single step is that in which the event was found.
         end_state = record.stop_state if self.steps.count == 1 else None
         if isinstance(record, CompiledRecord):
-            own, by = self._kernel_system, self._backend
+            own, by = self._kernel_system, self.backend
             return CompiledDenseOutput(own, self._system, scheme, self.steps, end_state, by)
         return DenseOutput(self._system, scheme, self.steps, end_state)
 
@@ -844,7 +878,7 @@ class FinishedRun:
     @cached_property
     def settings(self) -> Settings:
         return settings(
-            self._options, self._norm, self._controlled, self._backend, self._stiff_intervals
+            self._options, self._norm, self._controlled, self.backend, self._stiff_intervals
         )
 
     @property
@@ -880,8 +914,7 @@ class FinishedRun:
         if output is not None:
             least, largest, turned = output.least, output.largest, output.over_half_turn
         else:
-            dense = cast(DenseOutput, self.dense)
-            q = dense.nodes()[1][:, : self._mechanism.model.nq]
+            q = self.nodes[1][:, : self._system.nq]
             # The reductions themselves: their methods cost more than they do here.
             least, largest = np.minimum.reduce(q), np.maximum.reduce(q)
             turned = over_half_turn(self._mechanism, q)

@@ -99,7 +99,7 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Machine:
     return Machine(tmp_path_factory.mktemp("machine"))
 
 
-@pytest.mark.parametrize("folder", ["checkout", "neutral"])
+@pytest.mark.parametrize("folder", ["checkout", pytest.param("neutral", marks=pytest.mark.stress)])
 def test_python_and_the_command_line_use_the_kernel_in_every_folder(
     machine: Machine, folder: str
 ) -> None:

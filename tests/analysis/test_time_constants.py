@@ -97,6 +97,11 @@ def test_a_joint_that_a_drive_holds_has_none() -> None:
             "damping 40 N s/m",
             MASS / 160.0,
         ),
+        (
+            srm.CouplingSpring(("rail",), (2.0,), friction=0.3),
+            "friction 0.3 N at 0.001 m/s",
+            MASS / (4.0 * 0.3 / 0.001),
+        ),
         (srm.LimitSpring("rail", 9.0, 40.0, upper=1.0), "damping 40 N s/m", MASS / 40.0),
     ],
     ids=lambda value: getattr(value, "type", ""),

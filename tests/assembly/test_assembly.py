@@ -16,7 +16,7 @@ import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.assembly.assemble import Assembly
 from tests.support.bundled import load, rewritten
-from tests.support.mechanisms import along_x, floating_ring, rescaled, rod
+from tests.support.mechanisms import DISTINCT_MODELS, along_x, floating_ring, rescaled, rod
 from tests.support.snapshots import check_messages, refused
 
 PI = np.pi
@@ -82,7 +82,7 @@ def wrapped(angle: Any) -> Any:
 # --- bundled mechanisms -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [*srm.bundled_models(), "n_four_bar_7"])
+@pytest.mark.parametrize("name", [*DISTINCT_MODELS, "n_four_bar_7"])
 def test_a_loaded_mechanism_is_closed_and_its_rates_fit(name: str) -> None:
     mechanism = load(name)
     if mechanism.loops:

@@ -255,7 +255,8 @@ def simulated(problem: Problem, peer: Peer, setting: Setting) -> np.ndarray:
     """The observed coordinates of a run of the peer at the samples of the problem."""
     outcome = attempt(problem, peer.prepare(problem), setting)
     assert not isinstance(outcome, str), outcome
-    return problem.observe(*outcome[0].states())
+    run = outcome[0]
+    return problem.observe(*run.states()) if run.observed is None else run.observed()
 
 
 @pytest.mark.parametrize(
@@ -373,6 +374,7 @@ def test_the_command_needs_a_checkout(tmp_path: Path, monkeypatch: pytest.Monkey
     assert "--peers" in run("benchmark", "--help")
 
 
+@pytest.mark.stress
 def test_the_command_measures_from_a_checkout(tmp_path: Path) -> None:
     arguments = ["--out", str(tmp_path), "--thin", "--repeats", "1", "--sections", "work"]
     chosen = ["--problems", "pendulum_chain", "--peers", "ours", "pinocchio_dop853"]

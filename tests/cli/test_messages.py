@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,8 @@ from typer.testing import CliRunner
 
 import srm_mbs as srm
 from srm_mbs.cli.app import app
+from tests.support.sources import MODULES, PACKAGE, syntax_tree
 
-PACKAGE = Path(srm.__file__).parent
-TREES = {
-    path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text(encoding="utf-8"))
-    for path in sorted(PACKAGE.rglob("*.py"))
-}
 IMPERATIVES = (
     "Add Anchor Break Build Check Close Convert Correct Couple Cut Define Describe Drag Draw Drive "
     "Exchange Extend Free Give Hold Include Install Join Keep Leave Let Linearise Look Make "
@@ -58,13 +55,15 @@ def endings(node: ast.expr | None) -> list[str]:
     return literal_ends(node, -1)
 
 
-def calls() -> Iterator[tuple[str, str, ast.Call]]:
+@cache
+def calls() -> list[tuple[str, str, ast.Call]]:
     """Module and line, name without what is before its last dot, call."""
-    for module, tree in TREES.items():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Call):
-                name = ast.unparse(node.func).rpartition(".")[2]
-                yield f"{module}:{node.lineno}", name, node
+    return [
+        (f"{module}:{node.lineno}", ast.unparse(node.func).rpartition(".")[2], node)
+        for module in MODULES
+        for node in ast.walk(syntax_tree(module))
+        if isinstance(node, ast.Call)
+    ]
 
 
 def faults() -> Iterator[tuple[str, ast.expr | None, ast.expr | None]]:

@@ -54,6 +54,9 @@ def run(name: str, t_end: float, rtol: float = 1e-9) -> srm.Solution:
 def test_the_files_are_those_that_the_generator_writes(name: str) -> None:
     """But for the last digits, which come out differently on other processors."""
     for written, file in zip(MADE[name](), (f"urdf/{name}.urdf", f"models/{name}.toml")):
+        if not written:  # of a linkage
+            assert not (ROOT / file).exists()
+            continue
         kept = (ROOT / file).read_text(encoding="utf-8")
         assert NUMBER.split(kept) == NUMBER.split(written)
         found, expected = (np.array(NUMBER.findall(text), dtype=float) for text in (kept, written))
@@ -61,7 +64,7 @@ def test_the_files_are_those_that_the_generator_writes(name: str) -> None:
         np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize("name", DEGREES)
 def test_it_has_the_degrees_of_freedom_of_its_kind_and_does_not_drift(name: str) -> None:
     mechanism = load(name)
     assert mechanism.degrees_of_freedom == DEGREES[name]
@@ -256,7 +259,7 @@ def test_the_differential_gives_both_wheels_the_same_torque() -> None:
         assert damping * rate == pytest.approx(1.5 * 0.5, rel=1e-6)
 
 
-@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize("name", DEGREES)
 def test_the_energy_balance_closes(name: str) -> None:
     balance = run(name, 1.0).energy_balance
     assert np.abs(balance.residual).max() < 1e-8 * balance.scale

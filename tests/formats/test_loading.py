@@ -29,12 +29,13 @@ from tests.support.dynamics import (
     nonlinear_effects,
     states,
 )
+from tests.support.mechanisms import DISTINCT_MODELS
 from tests.support.snapshots import check_messages, refused
 from tests.support.urdf_files import placement, text
 from tools.models import made
 
 PI = np.pi
-NAMES = srm.bundled_models()
+NAMES = DISTINCT_MODELS
 
 # A tree with every kind of joint, oblique axes and placements, and a link welded on.
 INERTIAL = """<inertial><origin xyz="{c}" rpy="{r}"/><mass value="{m}"/>

@@ -88,6 +88,91 @@ def test_a_similar_variant_reuses_the_analysis_and_moves_as_one_with_its_own(
     assert np.abs(one(times)[0] - other(times)[0]).max() < 1e-7
 
 
+PRESS = """format = 1
+[parameters]
+crank = 0.1
+mass = 2.0
+along = 90.0
+stiffness = 100.0
+fixed = 0.0
+[planar]
+angle = "deg"
+ground = ["O", "G"]
+mass_per_length = 1.0
+[planar.points]
+O = [0, 0]
+A = ["=crank", 0]
+K = [0.4, 0.1]
+G = [0.4, "=0.5 + fixed"]
+D = [0.4, -0.3]
+[[planar.bar]]
+name = "crank"
+points = ["O", "A"]
+[[planar.bar]]
+name = "rod"
+points = ["A", "K"]
+mass = "=mass"
+[[planar.bar]]
+name = "upper"
+points = ["G", "K"]
+[[planar.bar]]
+name = "lower"
+points = ["K", "D"]
+[[planar.slider]]
+name = "ram"
+point = "D"
+along = "=along"
+mass = "=mass"
+[[planar.spring]]
+a = "G"
+b = "D"
+stiffness = "=stiffness"
+rest_length = 0.5
+"""
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"crank": 0.12},
+        {"crank": 0.12, "mass": 2.5},
+        {"mass": 3.0, "fixed": 0.01},
+        {"stiffness": 50.0, "crank": 0.11},
+        {"along": 89.0},
+    ],
+)
+def test_a_variant_is_the_mechanism_of_a_load_bit_by_bit(
+    values: dict[str, float], tmp_path: Path
+) -> None:
+    """With places, masses and forces that vary, and another line of a slide."""
+    path = tmp_path / "press.toml"
+    path.write_text(PRESS, encoding="utf-8")
+    variant, fresh = srm.load(path).with_parameters(**values), srm.load(path, parameters=values)
+    assert variant.model == fresh.model
+    for one, other in zip(variant.model.inertias, fresh.model.inertias):
+        assert np.array_equal(one.toDynamicParameters(), other.toDynamicParameters())
+    for name in ("loops", "forces", "drives", "points", "notes", "source", "parameters"):
+        assert getattr(variant, name) == getattr(fresh, name), name
+    for name in ("q0", "v0"):
+        assert np.array_equal(getattr(variant, name), getattr(fresh, name))
+
+
+def test_a_variant_with_a_fault_is_refused_as_a_load_is(tmp_path: Path) -> None:
+    path = tmp_path / "press.toml"
+    path.write_text(PRESS, encoding="utf-8")
+    base = srm.load(path)
+    for values in ({"crank": 0.0}, {"mass": -1.0}, {"mass": 0.0}, {"fixed": -0.4}, {"along": 1e31}):
+        refusals = []
+        for make in (
+            lambda given: base.with_parameters(**given),
+            lambda given: srm.load(path, parameters=given),
+        ):
+            with pytest.raises((srm.InputError, srm.AssemblyError)) as refused:
+                make(values)
+            refusals.append(str(refused.value))
+        assert refusals[0] == refusals[1]
+
+
 @pytest.mark.parametrize(
     ("values", "why"),
     [

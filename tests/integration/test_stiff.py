@@ -228,6 +228,30 @@ def test_a_stiff_damper_on_joints_of_a_tree_runs_alike_on_both_backends() -> Non
     np.testing.assert_allclose(runs[0].q[-1], runs[1].q[-1], atol=1e-8)
 
 
+def test_friction_on_several_joints_runs_alike_on_both_backends() -> None:
+    """It acts on a sum of rates that turns back while the joints do not."""
+    chain = srm.load("pendulum_chain")
+    cable = srm.CouplingSpring(chain.joint_names[:2], (1.0, -0.7), friction=4.0)
+    mechanism = replace(chain, forces=(cable,), friction_speed=1e-4)
+    runs = [srm.simulate(mechanism, 0.5, rtol=1e-6, backend=b) for b in BACKENDS]
+    assert all(run.success and run.settings.stiff for run in runs)
+    assert abs(runs[0].stats.steps - runs[1].stats.steps) <= 0.1 * runs[0].stats.steps
+    np.testing.assert_allclose(runs[0].q[-1], runs[1].q[-1], atol=1e-6)
+    model = chain.model
+    data = model.createData()
+
+    def field(t: float, y: FloatArray) -> FloatArray:
+        q, v = np.split(y, 2)
+        along = np.zeros(model.nv)
+        along[:2] = 1.0, -0.7
+        force = -4.0 * np.tanh(along @ v / 1e-4) * along - model.damping * v
+        return np.concatenate([v, pin.aba(model, data, q, v, force)])
+
+    start = np.concatenate([chain.q0, chain.v0])
+    expected = solve_ivp(field, (0.0, 0.5), start, method="Radau", rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(runs[0].q[-1], expected.y[: model.nq, -1], atol=1e-5)
+
+
 def test_undamped_stiff_springs_stay_with_explicit_steps() -> None:
     """A vibration that steps have to follow is not stiff."""
     mechanism = srm.load("four_bar")

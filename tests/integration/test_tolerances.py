@@ -19,6 +19,7 @@ from tests.support import reduced
 from tests.support.bundled import load
 from tests.support.convergence import fitted_order
 from tests.support.dynamics import mass_matrix
+from tests.support.mechanisms import DISTINCT_MODELS
 from tests.support.references import observed, reference
 
 PROBLEMS = {
@@ -161,7 +162,7 @@ UNKNOWN = 3.0
 
 
 @pytest.mark.stress
-@pytest.mark.parametrize("name", srm.bundled_models())
+@pytest.mark.parametrize("name", DISTINCT_MODELS)
 def test_no_tolerance_is_an_outlier_on_bundled_mechanisms(name: str) -> None:
     """Against the tightest run of another tableau, whose own error is its distance from the
     tightest run of dop853.  An error below the tolerance is no outlier, however accurate a looser

@@ -98,6 +98,17 @@ def rest(element: Any) -> float:
     return float(next((getattr(element, key) for key in RESTS if hasattr(element, key)), 0.0))
 
 
+def stretch(element: Any, y: FloatArray) -> FloatArray:
+    """y beyond where the spring is relaxed: one length, or those of a slack."""
+    beyond, slack = y - rest(element), getattr(element, "slack", 0.0)
+    return np.where(beyond < 0.0, beyond, np.maximum(beyond - slack, 0.0))
+
+
+def friction(element: Any, rate: FloatArray) -> FloatArray:
+    """The force of dry friction at the default friction speed of a mechanism, 0.01."""
+    return float(getattr(element, "friction", 0.0)) * np.tanh(rate / 0.01)
+
+
 def slope(of: Coordinates, q: FloatArray) -> FloatArray:
     """d(coordinates)/dq in the tangent space (rows, nv): central differences of order 4."""
     columns = []
@@ -135,6 +146,12 @@ CASES: dict[str, Any] = {
     "spring on several joints": srm.CouplingSpring(
         ("branch", "slide", "hinge"), (0.4, -2.0, 0.7), 30.0, 2.0, 0.1
     ),
+    "taut spring": srm.SpringDamper(ANCHOR_A, ANCHOR_B, 70.0, 3.0, 0.0, slack=0.1),
+    "pushed spring": srm.SpringDamper(ANCHOR_A, ANCHOR_B, 70.0, 3.0, 9.0, slack=0.1),
+    "slack spring": srm.SpringDamper(ANCHOR_A, ANCHOR_B, 70.0, 3.0, 0.0, slack=9.0),
+    "slack and friction on several joints": srm.CouplingSpring(
+        ("branch", "slide", "hinge"), (0.4, -2.0, 0.7), 30.0, 2.0, -0.2, slack=0.3, friction=4.0
+    ),
     "bushing between links": srm.Bushing(ANCHOR_A, ANCHOR_B, SIX_K, SIX_C),
     "bushing to the ground": srm.Bushing(ANCHOR_A, GROUND, SIX_K, SIX_C),
     "bushing from the ground": srm.Bushing(GROUND, ANCHOR_B, SIX_K),
@@ -148,12 +165,13 @@ every_case = pytest.mark.parametrize("element", CASES.values(), ids=CASES)
 @pytest.mark.parametrize("seed", range(3))
 @every_case
 def test_a_force_follows_from_its_coordinates_by_virtual_work(element: Any, seed: int) -> None:
-    """tau = -(dy/dq)^T (K (y - y_0) + C dy/dt), with y from frames and SciPy's rotations."""
+    """tau = -(dy/dq)^T (K (y - y_0) + C dy/dt) without slack and friction, with y from frames and
+    SciPy's rotations."""
     q, v = random_state(TREE, seed)
     y = coordinates(element)
     Y = slope(y, q)
-    stretched = np.array(element.stiffness) * (y(q) - rest(element))
-    expected = -Y.T @ (stretched + np.array(element.damping) * (Y @ v))
+    pulled = np.array(element.stiffness) * stretch(element, y(q)) + friction(element, Y @ v)
+    expected = -Y.T @ (pulled + np.array(element.damping) * (Y @ v))
     found = exerted((element,), q, v)
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
 
@@ -165,7 +183,7 @@ def test_the_energy_of_a_spring_is_that_of_its_coordinates(element: Any) -> None
     with_, without = (
         make_system(srm.Mechanism(TREE, forces=forces)).energy(state) for forces in ((element,), ())
     )
-    stretched = coordinates(element)(q) - rest(element)
+    stretched = stretch(element, coordinates(element)(q))
     expected = 0.5 * float(np.sum(np.array(element.stiffness) * stretched**2))
     assert with_ - without == pytest.approx(expected, rel=1e-12, abs=1e-12)
 
@@ -591,6 +609,8 @@ SENSELESS: dict[str, Callable[[], Any]] = {
     "a spring on one joint twice": lambda: srm.CouplingSpring(("a", "a"), (1.0, 2.0), 1.0),
     "a coefficient too few": lambda: srm.CouplingSpring(("a", "b"), (1.0,), 1.0),
     "a coefficient of zero": lambda: srm.CouplingSpring(("a", "b"), (1.0, 0.0), 1.0),
+    "a negative slack": lambda: srm.SpringDamper(ANCHOR_A, GROUND, 1.0, 0.0, 1.0, slack=-1.0),
+    "a negative friction": lambda: srm.CouplingSpring(("a", "b"), (1.0, 1.0), friction=-1.0),
     "a spring on joints without effect": lambda: srm.CouplingSpring(("a", "b"), (1.0, 1.0)),
     "a torsion spring without effect": lambda: srm.TorsionSpring("hinge"),
     "an infinite angle": lambda: srm.TorsionSpring("hinge", 1.0, 0.0, np.inf),

@@ -12,6 +12,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.model.model_data import model_from_data, model_to_data
 from tests.support.bundled import load
+from tests.support.mechanisms import DISTINCT_MODELS
 
 AXIS = np.array([0.6, 0.0, 0.8])
 JOINTS = {
@@ -92,7 +93,7 @@ def test_a_continuous_joint_about_any_axis_turns_about_it_after_json() -> None:
     np.testing.assert_allclose(*placements, rtol=0.0, atol=1e-15)
 
 
-@pytest.mark.parametrize("name", srm.bundled_models())
+@pytest.mark.parametrize("name", DISTINCT_MODELS)
 def test_bundled_models_are_the_same_after_json(name: str) -> None:
     model = load(name).model
 

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 import srm_mbs as srm
 from srm_mbs.simulation import energy_balance
 from tests.support.bundled import load
-from tests.support.mechanisms import rod
+from tests.support.mechanisms import DISTINCT_MODELS, rod
 from tests.support.reduced import G
 
 
@@ -66,13 +66,13 @@ def closing(name: str, longest: float) -> float:
     return balance.relative
 
 
-@pytest.mark.parametrize("name", srm.bundled_models())
+@pytest.mark.parametrize("name", DISTINCT_MODELS)
 def test_it_closes_on_the_bundled_mechanisms(name: str) -> None:
     assert closing(name, 0.05) < 1e-10
 
 
 @pytest.mark.stress
-@pytest.mark.parametrize("name", srm.bundled_models())
+@pytest.mark.parametrize("name", DISTINCT_MODELS)
 def test_it_closes_on_the_bundled_mechanisms_over_ten_seconds(name: str) -> None:
     assert closing(name, 10.0) < 1e-8
 

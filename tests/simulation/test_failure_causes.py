@@ -27,7 +27,7 @@ def damper(gain: float) -> Callable[..., Any]:
 
 
 @on_both
-@pytest.mark.parametrize("gain", [1000.0, 3000.0])
+@pytest.mark.parametrize("gain", [1000.0, pytest.param(3000.0, marks=pytest.mark.stress)])
 def test_an_unstable_sampled_controller_is_the_cause_that_a_run_names(
     backend: str, gain: float
 ) -> None:

@@ -12,23 +12,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-import srm_mbs as srm
 from srm_mbs.formats.load import models_folder
 from tests.stress.isolation import ROOT, fault_of, load_isolated
 from tests.stress.mutation import DEFAULTS, LOOPS, NAMES, START, TREE, Files, Mutation
 from tests.stress.toml_mutations import TomlMutator
 from tests.stress.urdf_mutations import UrdfMutator
+from tests.support.mechanisms import DISTINCT_MODELS
 
 pytestmark = pytest.mark.stress
 
 COUNT = 1000
-ON_THE_COMMAND_LINE = 50
+ON_THE_COMMAND_LINE = 20
 PARTS = (TREE, LOOPS, START, DEFAULTS, NAMES)
 
 
 def bundled_files() -> dict[str, Files]:
     out = {}
-    for name in srm.bundled_models():
+    for name in DISTINCT_MODELS:
         toml = (models_folder() / f"{name}.toml").read_text()
         urdf = tomllib.loads(toml).get("urdf")
         if urdf is not None:  # linkages typed in have none

@@ -20,7 +20,7 @@ from tests.support.mechanisms import floating_ring
 
 pytestmark = pytest.mark.stress
 
-COUNT = 10_000
+COUNT = 4_000
 SECONDS = 1200.0
 MOST_CRASHES = 5
 MOST_REFUSED_LATE = 10

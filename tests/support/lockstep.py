@@ -162,8 +162,8 @@ def compare(
             memory = passing.next(t, x, memory)
             control.set_target_time(passing.end)
             out.entered += 1
-            assert run.at_breakpoint
-            run.enter()
+            assert run.core.at_breakpoint
+            run.core.enter()
             change = run.memory().rate - memory.rate
             out.enlarge(rates=np.max(np.abs(change) / (np.abs(memory.rate) + one)))
         limit = min(max_step, system.step_limit(x))
@@ -181,7 +181,7 @@ def compare(
             result = None
         decision = control.decide(proposal, result)
         out.attempts += 1
-        out.enlarge(h=abs(run.h - proposal.h) / proposal.h)
+        out.enlarge(h=abs(run.core.h - proposal.h) / proposal.h)
         if decision is not compiled_decision:
             out.decisions.append((t, decision, compiled_decision))
         if result is not None:

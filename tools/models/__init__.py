@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 
 def made() -> dict[str, Callable[[], tuple[str, str]]]:
-    """What makes each model: URDF and description, by name."""
+    """What makes each model: URDF, empty for a linkage, and description, by name."""
     from tools.models.gears import GEARS
     from tools.models.parallel import PARALLEL
     from tools.models.planar import PLANAR

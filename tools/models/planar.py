@@ -6,13 +6,13 @@ metre join them.  Joints turn about -y, so that positive angles go from x to z.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
 
-from tools.models.description import header
+from tools.models.description import header, join, toml
 from tools.models.urdf_text import Mass, Shape, Urdf, Vector, bar, box, tube, vector
 
 AXIS = vector(0.0, -1.0, 0.0)
@@ -111,6 +111,51 @@ def description(linkage: Linkage, text: str, rest: str) -> str:
     return "\n\n".join([header(linkage.name, text).rstrip(), *linkage.loops, rest.strip()]) + "\n"
 
 
+@dataclass
+class Drawing:
+    """The same mechanisms as a section ``[planar]``: named points, and bars between them whose mass
+    and inertia are those of the links."""
+
+    name: str
+    text: str
+    width: float
+    ground: tuple[str, ...]
+    rates: str
+    points: dict[str, Vector] = field(default_factory=dict)
+    bars: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def _bar(self, name: str) -> str:
+        places = [vector(x, 0.0, z) for x, z in (self.points[each] for each in self.bars[name])]
+        parts = [
+            bar(start, end, DENSITY * float(np.linalg.norm(end - start)), self.width)
+            for start, end in combinations(places, 2)
+        ]
+        whole = parts[0]
+        for part in parts[1:]:
+            whole = whole + part
+        return (
+            f'[[planar.bar]]\nname = "{name}"\npoints = {quoted(self.bars[name])}\n'
+            f"mass = {whole.mass:.17g}\ninertia = {whole.inertia[1, 1]:.17g}\n"
+        )
+
+    def description(self, t_end: str) -> str:
+        """The text of the description, whose runs end at ``t_end`` (s)."""
+        comment = header(self.name, self.text).partition("urdf =")[0]
+        points = "".join(f"{name} = {toml(at)}\n" for name, at in self.points.items())
+        return join(
+            comment,
+            f"[planar]\nground = {quoted(self.ground)}\nrates = {self.rates}\n",
+            f"[planar.points]\n{points}",
+            *map(self._bar, self.bars),
+            f"[simulation]\nt_end = {t_end}\nrtol = 1e-8\n",
+        )
+
+
+def quoted(names: Iterable[str]) -> str:
+    """A list of names."""
+    return "[" + ", ".join(f'"{name}"' for name in names) + "]"
+
+
 TURNING = """
 [initial]
 q = { crank = 0.0 }
@@ -153,6 +198,33 @@ def watt_six_bar() -> tuple[str, str]:
         TURNING,
     )
     return plane.urdf.text(), text
+
+
+def watt_six_bar_planar() -> tuple[str, str]:
+    """:func:`watt_six_bar` typed in as points and bars."""
+    a, d = vector(0.0, 0.0), vector(1.0, 0.0)
+    b = a + 0.3 * vector(np.cos(1.0), np.sin(1.0))
+    c = meeting(b, 0.9, d, 0.7, left=True)
+    e = meeting(b, 0.75, c, 0.6, left=True)
+    f = meeting(d, 1.2, c, 0.6, left=False)
+    g = meeting(e, 0.9, f, 0.8, left=True)
+    plane = Drawing(
+        "watt_six_bar_planar",
+        "The bundled watt_six_bar typed in as points and bars. The angle of the crank counts from "
+        "the x axis; bars have the masses and inertias of its links.",
+        0.035,
+        ("A", "D"),
+        "{ A = 8.0 }",
+        {"A": a, "B": b, "C": c, "D": d, "E": e, "F": f, "G": g},
+        {
+            "crank": ("A", "B"),
+            "coupler": ("B", "C", "E"),
+            "left": ("E", "G"),
+            "rocker": ("D", "C", "F"),
+            "right": ("F", "G"),
+        },
+    )
+    return "", plane.description("5.0")
 
 
 def stephenson_six_bar() -> tuple[str, str]:
@@ -248,8 +320,48 @@ rtol = 1e-8
     return plane.urdf.text(), text
 
 
+def jansen_walker_planar() -> tuple[str, str]:
+    """:func:`jansen_walker` typed in as points and bars."""
+    n = JANSEN
+    plane = Drawing(
+        "jansen_walker_planar",
+        "The bundled jansen_walker typed in as points and bars. The angle of the crank counts from "
+        "the x axis; bars have the masses and inertias of its links.",
+        0.025,
+        ("O", "hip_left", "hip_right"),
+        "{ O = 6.0 }",
+        {"O": vector(0.0, 0.0)},
+        {"crank": ("O", "pin_0", "pin_1")},
+    )
+    for side, sign in (("left", -1.0), ("right", 1.0)):
+        plane.points[f"hip_{side}"] = vector(sign * n["a"], -n["l"])
+    for k, angle in enumerate((0.5, 0.5 + np.pi)):
+        pin = plane.points[f"pin_{k}"] = n["m"] * vector(np.cos(angle), np.sin(angle))
+        for side, mirrored in (("left", False), ("right", True)):
+            leg, hip = f"{side}_{k}", plane.points[f"hip_{side}"]
+            above = meeting(pin, n["j"], hip, n["b"], left=mirrored)
+            below = meeting(pin, n["k"], hip, n["c"], left=not mirrored)
+            back = meeting(hip, n["d"], above, n["e"], left=not mirrored)
+            ankle = meeting(back, n["f"], below, n["g"], left=mirrored)
+            foot = meeting(ankle, n["h"], below, n["i"], left=mirrored)
+            found = {"above": above, "below": below, "back": back, "ankle": ankle, "foot": foot}
+            plane.points |= {f"{leg}_{name}": at for name, at in found.items()}
+            own = {name: f"{leg}_{name}" for name in found}
+            plane.bars |= {
+                f"{leg}_j": (f"pin_{k}", own["above"]),
+                f"{leg}_k": (f"pin_{k}", own["below"]),
+                f"{leg}_hip": (f"hip_{side}", own["above"], own["back"]),
+                f"{leg}_f": (own["back"], own["ankle"]),
+                f"{leg}_c": (f"hip_{side}", own["below"]),
+                f"{leg}_foot": (own["below"], own["ankle"], own["foot"]),
+            }
+    return "", plane.description("3.0")
+
+
 PLANAR: dict[str, Callable[[], tuple[str, str]]] = {
     "watt_six_bar": watt_six_bar,
+    "watt_six_bar_planar": watt_six_bar_planar,
+    "jansen_walker_planar": jansen_walker_planar,
     "stephenson_six_bar": stephenson_six_bar,
     "jansen_walker": jansen_walker,
 }

@@ -33,9 +33,7 @@ public:
 
     nb::object tangential(const Array& w) const {
         std::vector<double> x = checked(w, nv_);
-        projection_->whiten_velocity(x.data());
-        projection_->remove_normal(x.data());
-        projection_->unwhiten(x.data());
+        make_tangential(x.data());
         return owned_array(std::move(x));
     }
 
@@ -102,6 +100,16 @@ public:
 
     // Factorises the rows that were written, and solves for the shortest x (nv,) with G x = g.
     void factor_written(double threshold) { factor_columns(threshold); }
+    // The same in the metric M (nv, nv), of which the upper triangle is read.
+    void factor_in_metric(const double* M, double threshold) {
+        projection_->factor(M, zeros_.data(), zeros_.data(), threshold);
+    }
+    // x = (1 - P) x (nv,), in place.
+    void make_tangential(double* x) const {
+        projection_->whiten_velocity(x);
+        projection_->remove_normal(x);
+        projection_->unwhiten(x);
+    }
     void shortest(const double* g, double* x) const {
         projection_->normal(g, x);
         projection_->unwhiten(x);
@@ -115,7 +123,7 @@ public:
 private:
     void factor(const double* M, const Array& G, double threshold) {
         take(G);
-        projection_->factor(M, zeros_.data(), zeros_.data(), threshold);
+        factor_in_metric(M, threshold);
     }
 
     // With M = 1.
@@ -124,7 +132,7 @@ private:
             one_.assign(static_cast<std::size_t>(nv_) * nv_, 0.0);
             for (int i = 0; i < nv_; ++i) one_[static_cast<std::size_t>(i) * (nv_ + 1)] = 1.0;
         }
-        projection_->factor(one_.data(), zeros_.data(), zeros_.data(), threshold);
+        factor_in_metric(one_.data(), threshold);
     }
 
     void take(const Array& G) {

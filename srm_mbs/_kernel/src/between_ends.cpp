@@ -22,27 +22,27 @@ void DenseOutput::between_ends(System& system, const double* t, long k, const do
 // Places and rates at the ends around a step, in its chart; none where there are not enough.
 void DenseOutput::take_ends(System& system, long step, EndNodes& ends) const {
     ends.step = step;
-    const std::vector<long> nodes = nodes_away(system, step, constants_.nodes[2]);
-    const auto count = nodes.size();
+    const Nodes nodes = nodes_away(system, step, constants_.nodes[2]);
+    const int count = nodes.count;
     ends.points.clear();
-    if (static_cast<int>(count) < constants_.nodes[2]) return;
-    ends.places.resize(count * n_);
-    ends.rates.resize(count * n_);
+    if (count < constants_.nodes[2]) return;
+    ends.places.resize(static_cast<std::size_t>(count) * n_);
+    ends.rates.resize(static_cast<std::size_t>(count) * n_);
     const double* const times = steps_.times;
     const double h = times[step + 1] - times[step];
     const long last = smooth_interval(step).second;
     std::vector<double> near(n_ / 2);
-    for (std::size_t i = 0; i < count; ++i) {
+    for (int i = 0; i < count; ++i) {
+        const long node = nodes.at[i];
         double* const place = &ends.places[i * n_];
-        ends.points.push_back((times[nodes[i]] - times[step]) / h);
-        if (system.wraps()) motion(step, nodes[i], near.data());
-        system.difference(steps_.states + step * nx_, steps_.states + nodes[i] * nx_, near.data(),
-                          place);
-        system.chart_rate(place, rate_at(nodes[i], last), &ends.rates[i * n_]);
+        ends.points.push_back((times[node] - times[step]) / h);
+        if (system.wraps()) motion(step, node, near.data());
+        system.difference(steps_.states + step * nx_, steps_.states + node * nx_, near.data(), place);
+        system.chart_rate(place, rate_at(node, last), &ends.rates[i * n_]);
     }
     // The fewer nodes are those nearest to the middle of the step.
     std::vector<int> order(count);
-    for (std::size_t i = 0; i < count; ++i) order[i] = static_cast<int>(i);
+    for (int i = 0; i < count; ++i) order[i] = i;
     std::stable_sort(order.begin(), order.end(), [&](int a, int b) {
         return std::abs(ends.points[a] - 0.5) < std::abs(ends.points[b] - 0.5);
     });

@@ -18,7 +18,7 @@ void Extension::check() const {
 
 void DenseConstants::check() const {
     expect_size("nodes", nodes.size(), 3);
-    expect_within("nodes", nodes, 2, std::numeric_limits<int>::max());
+    expect_within("nodes", nodes, 2, DenseOutput::most_nodes);
     if (!std::is_sorted(nodes.begin(), nodes.end()))
         throw std::invalid_argument("nodes do not ascend");
 }
@@ -33,7 +33,8 @@ DenseOutput::DenseOutput(int nq, int nv, const std::vector<SchemeDense>& schemes
       polynomials_(steps_.count),
       places_(steps_.count, Place::unknown),
       delta_(n_),
-      x_(nx_) {
+      x_(std::max(nx_, n_)),
+      near_(nv) {
     if (steps_.count < 1) throw std::invalid_argument("there are no steps");
     if (schemes.empty()) throw std::invalid_argument("there are no schemes");
     for (const auto& [abscissae, extension] : schemes) {
@@ -137,7 +138,7 @@ const std::vector<double>& DenseOutput::extra_rates(System& system, long step, d
     if (!kept.empty() || steps_.width >= extension.n_rates) return kept;
     std::vector<double> out;  // kept only once all of them could be evaluated
     const double* rates = steps_.rates + step * steps_.width * n_;
-    std::vector<double> rate(n_);
+    rate_.resize(n_);
     system.begin_step(steps_.times[step], steps_.states + step * nx_);
     out.assign(static_cast<std::size_t>(extension.extra_stages()) * n_, 0.0);
     for (int i = 0; i < extension.extra_stages(); ++i) {
@@ -152,8 +153,8 @@ const std::vector<double>& DenseOutput::extra_rates(System& system, long step, d
         system.retract(steps_.states + step * nx_, delta_.data(), x_.data());
         system.evaluate(steps_.times[step] + extension.extra_c[i] * h, x_.data(),
                          System::ZoneView{});
-        system.rate(rate.data());
-        system.chart_rate(delta_.data(), rate.data(), &out[i * n_]);
+        system.rate(rate_.data());
+        system.chart_rate(delta_.data(), rate_.data(), &out[i * n_]);
     }
     system.end_step();
     kept = std::move(out);
@@ -185,8 +186,8 @@ void DenseOutput::extended(System& system, long step, double theta, double* out)
 
 // Up to `count` ends of steps around the step, none too close together, with `least_sigma` at least,
 // and no more than `reach` steps away.
-std::vector<long> DenseOutput::nodes(const System& system, long step, int count,
-                                     double least_sigma, long reach) const {
+DenseOutput::Nodes DenseOutput::nodes(const System& system, long step, int count,
+                                      double least_sigma, long reach) const {
     const double *times = steps_.times, *start = steps_.states + step * nx_;
     const double near = constants_.spacing * (times[step + 1] - times[step]);
     const long width = static_cast<long>(scheme_of(step).abscissae.size());
@@ -195,33 +196,36 @@ std::vector<long> DenseOutput::nodes(const System& system, long step, int count,
     long i = step, j = step + 1;
     if (reach < i - first) first = i - reach;
     if (reach < last - j) last = j + reach;
-    std::vector<long> before, after;
-    while (static_cast<int>(before.size() + after.size()) < count && (i >= first || j <= last)) {
-        const bool left = i >= first && (j > last || before.size() <= after.size());
+    long before[most_nodes], after[most_nodes];
+    int left_count = 0, right_count = 0;
+    while (left_count + right_count < count && (i >= first || j <= last)) {
+        const bool left = i >= first && (j > last || left_count <= right_count);
         const long node = left ? i-- : j++;
-        std::vector<long>& own = left ? before : after;
-        if (!own.empty() && std::abs(times[own.back()] - times[node]) < near) continue;
+        long* const own = left ? before : after;
+        int& found = left ? left_count : right_count;
+        if (found && std::abs(times[own[found - 1]] - times[node]) < near) continue;
         if (!system.reachable(start, steps_.states + node * nx_)) {
             if (left) first = node + 1;
             else last = node - 1;
         } else if (least_sigma <= 0.0 ||
                    steps_.sigmas[node < steps_.count ? node * width : steps_.count * width - 1] >=
                        least_sigma) {
-            own.push_back(node);
+            own[found++] = node;
         }
     }
-    before.insert(before.end(), after.begin(), after.end());
-    std::sort(before.begin(), before.end());
-    return before;
+    Nodes out;
+    for (int k = left_count; k-- > 0;) out.at[out.count++] = before[k];
+    for (int k = 0; k < right_count; ++k) out.at[out.count++] = after[k];
+    return out;
 }
 
 // As nodes(), without ends whose rates may carry rounding; all if few others are near, or none on
 // one side of the step: polynomials are no extrapolations.
-std::vector<long> DenseOutput::nodes_away(const System& system, long step, int count) const {
-    std::vector<long> away =
+DenseOutput::Nodes DenseOutput::nodes_away(const System& system, long step, int count) const {
+    const Nodes away =
         nodes(system, step, count, constants_.branch_below, constants_.away_reach);
-    const bool within = static_cast<int>(away.size()) >= constants_.least_away &&
-                        away.front() <= step && away.back() > step;
+    const bool within = away.count >= constants_.least_away && away.at[0] <= step &&
+                        away.at[away.count - 1] > step;
     return within ? away : nodes(system, step, count);
 }
 
@@ -252,42 +256,43 @@ double DenseOutput::variable(long step, double theta, bool in_layer, double* gro
 }
 
 // Divided differences of the states and rates at ends of steps, in the chart of the step.
-DenseOutput::Polynomial DenseOutput::hermite(System& system, long step,
-                                             const std::vector<long>& nodes, bool in_layer) {
+void DenseOutput::hermite(System& system, long step, const Nodes& nodes, bool in_layer,
+                          Polynomial& out) {
     const double *times = steps_.times, *start = steps_.states + step * nx_;
     const double h = times[step + 1] - times[step];
-    Polynomial out;
+    const int k = 2 * nodes.count;
     out.in_layer = in_layer;
-    std::vector<double> slopes, rate(n_), near(n_ / 2);
-    const long last = smooth_interval(step).second;
-    for (long i : nodes) {
-        double growth;
-        const double at = variable(step, (times[i] - times[step]) / h, in_layer, &growth);
-        motion(step, i, near.data());
-        system.difference(start, steps_.states + i * nx_, near.data(), delta_.data());
-        system.chart_rate(delta_.data(), rate_at(i, last), rate.data());
-        for (int twice = 0; twice < 2; ++twice) {
-            out.points.push_back(at);
-            out.coefficients.insert(out.coefficients.end(), delta_.begin(), delta_.end());
-        }
-        for (double& value : rate) value *= h / growth;
-        slopes.insert(slopes.end(), rate.begin(), rate.end());
-    }
-    const int k = static_cast<int>(out.points.size());
+    out.points.resize(k);
+    out.coefficients.resize(static_cast<std::size_t>(k) * n_);
+    slopes_.resize(static_cast<std::size_t>(nodes.count) * n_);
     std::vector<double>& c = out.coefficients;
+    const long last = smooth_interval(step).second;
+    for (int node = 0; node < nodes.count; ++node) {
+        const long i = nodes.at[node];
+        double growth;
+        out.points[2 * node] = out.points[2 * node + 1] =
+            variable(step, (times[i] - times[step]) / h, in_layer, &growth);
+        double* const here = &c[2 * node * n_];
+        double* const slope = &slopes_[node * n_];
+        if (system.wraps()) motion(step, i, near_.data());
+        system.difference(start, steps_.states + i * nx_, near_.data(), here);
+        std::copy_n(here, n_, here + n_);
+        system.chart_rate(here, rate_at(i, last), slope);
+        for (int m = 0; m < n_; ++m) slope[m] *= h / growth;
+    }
     for (int order = 1; order < k; ++order) {
         for (int i = k - 1; i >= order; --i) {
             const double span = out.points[i] - out.points[i - order];
-            double* here = &c[i * n_];
+            double* const here = &c[i * n_];
             if (span == 0.0) {
-                std::copy_n(&slopes[(i / 2) * n_], n_, here);
+                std::copy_n(&slopes_[(i / 2) * n_], n_, here);
             } else {
-                const double* below = &c[(i - 1) * n_];
-                for (int m = 0; m < n_; ++m) here[m] = (here[m] - below[m]) / span;
+                const double* const below = here - n_;
+                const double by = 1.0 / span;
+                for (int m = 0; m < n_; ++m) here[m] = (here[m] - below[m]) * by;
             }
         }
     }
-    return out;
 }
 
 void DenseOutput::value(const Polynomial& polynomial, double theta, double* out) const {
@@ -308,30 +313,33 @@ const DenseOutput::Polynomial& DenseOutput::best_polynomial(System& system, long
     if (!out.points.empty()) return out;
     const bool layer = steps_.layers && steps_.layers[2 * step + 1] > 0.0;
     double best = std::numeric_limits<double>::infinity();
-    std::vector<std::vector<long>> ends, away;
-    for (int count : constants_.nodes) {
-        ends.push_back(nodes(system, step, count));
-        away.push_back(nodes_away(system, step, count));
+    Nodes ends[3], away[3];
+    bool same = true;
+    for (int k = 0; k < 3; ++k) {
+        ends[k] = nodes(system, step, constants_.nodes[k]);
+        away[k] = nodes_away(system, step, constants_.nodes[k]);
+        same = same && ends[k].count == away[k].count &&
+               std::equal(ends[k].at, ends[k].at + ends[k].count, away[k].at);
     }
     for (const auto& [in_layer, chosen] :
          {std::pair(false, &ends), {false, &away}, {true, &ends}}) {
-        if (in_layer ? !layer : chosen == &away && away == ends) continue;
-        std::vector<Polynomial> tried;
-        for (const auto& own : *chosen) tried.push_back(hermite(system, step, own, in_layer));
+        if (in_layer ? !layer : chosen == &away && same) continue;
+        for (int k = 0; k < 3; ++k) hermite(system, step, (*chosen)[k], in_layer, tried_[k]);
         double changes[2] = {0.0, 0.0};
-        std::vector<double> a(n_), b(n_);
-        for (int k = 0; k < 2; ++k)
-            for (double theta : constants_.probes) {
-                const double at = variable(step, theta, in_layer);
-                value(tried[k], at, a.data());
-                value(tried[k + 1], at, b.data());
+        for (const double theta : constants_.probes) {
+            const double at = variable(step, theta, in_layer);
+            value(tried_[0], at, x_.data());
+            for (int k = 0; k < 2; ++k) {
+                std::copy_n(x_.data(), n_, delta_.data());
+                value(tried_[k + 1], at, x_.data());
                 for (int i = 0; i < n_; ++i)
-                    changes[k] = std::max(changes[k], std::abs(b[i] - a[i]));
+                    changes[k] = std::max(changes[k], std::abs(x_[i] - delta_[i]));
             }
+        }
         const double change = std::min(changes[0], changes[1]);
         if (!(change < best) && !out.points.empty()) continue;
         best = change;
-        out = tried[changes[1] <= changes[0] ? 1 : 0];
+        out = tried_[changes[1] <= changes[0] ? 1 : 0];
     }
     return out;
 }

@@ -71,6 +71,8 @@ public:
     // within `allowed` (n,).
     void between_ends(System& system, const double* t, long k, const double* allowed, double* out);
 
+    static constexpr int most_nodes = 16;  // of a polynomial
+
 private:
     // Ends around a step: fractions of the step, places and rates there in its chart, and those
     // nearest to it.
@@ -83,6 +85,10 @@ private:
     void take_ends(System& system, long step, EndNodes& ends) const;
     bool through_ends(System& system, const EndNodes& ends, double theta, const double* allowed,
                       double* out);
+    struct Nodes {
+        int count = 0;
+        long at[most_nodes];  // ends of steps, ascending
+    };
     struct Polynomial {
         std::vector<double> points, coefficients;  // (k,), (k, n): Newton form
         bool in_layer = false;  // a polynomial in the variable of the layer
@@ -93,11 +99,11 @@ private:
     const std::vector<double>& extra_rates(System& system, long step, double h);
     void extended(System& system, long step, double theta, double* out);
     const Polynomial& best_polynomial(System& system, long step);
-    std::vector<long> nodes(const System& system, long step, int count, double least_sigma = 0.0,
-                            long reach = std::numeric_limits<long>::max()) const;
+    Nodes nodes(const System& system, long step, int count, double least_sigma = 0.0,
+                long reach = std::numeric_limits<long>::max()) const;
     void motion(long step, long node, double* out) const;
-    std::vector<long> nodes_away(const System& system, long step, int count) const;
-    Polynomial hermite(System& system, long step, const std::vector<long>& nodes, bool in_layer);
+    Nodes nodes_away(const System& system, long step, int count) const;
+    void hermite(System& system, long step, const Nodes& nodes, bool in_layer, Polynomial& out);
     double variable(long step, double theta, bool in_layer, double* growth = nullptr) const;
     void value(const Polynomial& polynomial, double theta, double* out) const;
 
@@ -121,7 +127,8 @@ private:
     std::vector<Polynomial> polynomials_;
     enum class Place : char { unknown, regular, near_singular };
     std::vector<Place> places_;
-    std::vector<double> delta_, x_, weights_;
+    std::vector<double> delta_, x_, weights_, near_, rate_, slopes_;
+    Polynomial tried_[3];
 };
 
 }  // namespace srm

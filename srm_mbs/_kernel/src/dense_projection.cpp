@@ -107,8 +107,6 @@ public:
         }
     }
 
-    void use_factor(GeneratedTerms::Factor* factor) override { generated_ = factor; }
-
     bool sparse() const override { return false; }
     std::size_t entries() const override { return A_.size(); }
 
@@ -123,19 +121,12 @@ private:
 
     void factorise(const double* M, const double* f, const double* bias, double) override {
         const int n = count();
-        if (generated_) {
-            if (generated_(M, f, bias, A_.data(), U_.data(), inverse_.data(), white_force.data(),
-                           gamma_.data(), tau_.data(), inverse_pivots_.data(), row_squares_.data(),
-                           order_.data()) != 0)
-                throw EvaluationError{Failure::mass_matrix};
-        } else {
-            std::copy(M, M + n * n, U_.begin());
-            std::copy(f, f + n, white_force.begin());
-            whiten_all();
-            for (int j = 0; j < rows; ++j)
-                gamma_[j] = dot(&A_[j * n], white_force.data(), n) + bias[j];
-            pivoted_qr();
-        }
+        std::copy(M, M + n * n, U_.begin());
+        std::copy(f, f + n, white_force.begin());
+        whiten_all();
+        for (int j = 0; j < rows; ++j)
+            gamma_[j] = dot(&A_[j * n], white_force.data(), n) + bias[j];
+        pivoted_qr();
         for (int k = 0; k < structural_rank; ++k) pivots_[k] = std::abs(A_[k * n + k]);
     }
 
@@ -235,7 +226,6 @@ private:
         add(-s, v, x + k + 1, below);
     }
 
-    GeneratedTerms::Factor* generated_ = nullptr;
     std::vector<double> U_, inverse_, row_, A_, tau_, inverse_pivots_, squares_;
     std::vector<int> order_;
 };

@@ -54,6 +54,11 @@ void add_wrench(const ForceElement& e, const pinocchio::Data& data, const Vector
         Eigen::Map<Vector6>(sums.on_bodies + 6 * e.b.joint) -= wrench;
 }
 
+// Stretch of a spring beyond its rest length, without force up to its slack from there.
+double stretched(const ForceElement& e, double beyond) {
+    return beyond - std::min(std::max(beyond, 0.0), slack(e));
+}
+
 void spring_damper(const ForceElement& e, double coincident, const pinocchio::Data& data,
                    const Sums& sums, ForceLaws* laws, int law) {
     const Vector3d at_a = placement(e.a, data).translation();
@@ -63,7 +68,10 @@ void spring_damper(const ForceElement& e, double coincident, const pinocchio::Da
     if (length < coincident * e.rest) throw EvaluationError{Failure::coincident};
     // k (l - l0) apart/l, without dividing where l = l0 = 0.
     Vector3d force = -e.stiffness * apart;
-    if (e.rest != 0.0) force *= 1.0 - e.rest / length;
+    if (slack(e) != 0.0)
+        force *= stretched(e, length - e.rest) / (length != 0.0 ? length : 1.0);
+    else if (e.rest != 0.0)
+        force *= 1.0 - e.rest / length;
     if (e.damping != 0.0) {
         const Vector3d rate = point_velocity(velocity(e.a, data), at_a) -
                               point_velocity(velocity(e.b, data), at_b);
@@ -73,7 +81,7 @@ void spring_damper(const ForceElement& e, double coincident, const pinocchio::Da
         force -= e.damping * along;
     }
     if (laws && law >= 0) {
-        const Vector3d line = apart / length;
+        const Vector3d line = apart / (length != 0.0 ? length : 1.0);
         const double own = force.dot(line), acting = laws->acting(law, own);
         if (acting != own) force = acting * line;
     }
@@ -113,7 +121,8 @@ void coupling_spring(const ForceElement& e, const double* q, const double* v, do
         sum += e.signs[k] * q[e.positions[k]];
         rate += e.signs[k] * v[e.columns[k]];
     }
-    double force = -(e.stiffness * (sum - e.rest) + e.damping * rate);
+    double force = -(e.stiffness * stretched(e, sum - e.rest) + e.damping * rate);
+    if (friction(e) != 0.0) force -= friction(e) * std::tanh(rate / e.numbers[2]);
     if (laws) force = laws->acting(law, force);
     for (std::size_t k = 0; k < e.columns.size(); ++k) tau[e.columns[k]] += e.signs[k] * force;
 }
@@ -206,10 +215,11 @@ double linear_energy(double stiffness, double stretch) {
 double energy(const ForceElement& e, const pinocchio::Data& data, const double* q) {
     switch (e.kind) {
         case ForceKind::spring_damper:
-            return linear_energy(e.stiffness, (placement(e.a, data).translation() -
-                                               placement(e.b, data).translation())
-                                                      .norm() -
-                                                  e.rest);
+            return linear_energy(
+                e.stiffness, stretched(e, (placement(e.a, data).translation() -
+                                           placement(e.b, data).translation())
+                                                  .norm() -
+                                              e.rest));
         case ForceKind::torsion_spring:
             return linear_energy(e.stiffness, q[e.in_q] - e.rest);
         case ForceKind::bushing:
@@ -217,7 +227,7 @@ double energy(const ForceElement& e, const pinocchio::Data& data, const double* 
         case ForceKind::limit_spring:
             return limit_spring_energy(e, q[e.in_q]);
         case ForceKind::coupling_spring:
-            return linear_energy(e.stiffness, coupling_stretch(e, q));
+            return linear_energy(e.stiffness, stretched(e, coupling_stretch(e, q)));
         case ForceKind::joint_torque:
         case ForceKind::wrench:
             break;
@@ -232,14 +242,28 @@ void ForceElement::check() const {
     if (kind == ForceKind::wrench) expect_size("numbers", numbers.size(), 6);
     if (kind == ForceKind::bushing) expect_size("numbers", numbers.size(), 12);
     if (kind == ForceKind::limit_spring) expect_size("numbers", numbers.size(), 3);
-    if (kind == ForceKind::coupling_spring)
+    if (kind == ForceKind::coupling_spring) {
         expect_size("positions", positions.size(), columns.size());
+        if (!numbers.empty()) expect_size("numbers", numbers.size(), 3);
+    }
+    if (kind == ForceKind::spring_damper && !numbers.empty())
+        expect_size("numbers", numbers.size(), 1);
     if (curves.size() > 1) expect_size("curves", curves.size(), numbers.size());
 }
 
 bool acts_on_several(const ForceElement& e) {
     return e.kind == ForceKind::spring_damper || e.kind == ForceKind::wrench ||
            e.kind == ForceKind::bushing || e.kind == ForceKind::coupling_spring;
+}
+
+double slack(const ForceElement& e) { return e.numbers.empty() ? 0.0 : e.numbers[0]; }
+
+double friction(const ForceElement& e) { return e.numbers.empty() ? 0.0 : e.numbers[1]; }
+
+double FrictionSum::of(const double* v) const {
+    double out = 0.0;
+    for (std::size_t k = 0; k < columns.size(); ++k) out += coefficients[k] * v[columns[k]];
+    return out;
 }
 
 bool turns(const ForceElement& e) {
@@ -309,7 +333,7 @@ void ForceLaws::resolve(const std::vector<ForceElement>& elements,
     first_of_elements_ = count;
     for (std::size_t k = 0; k < elements.size(); ++k) {
         const ForceElement& e = elements[k];
-        if ((e.kind == ForceKind::spring_damper && e.rest > 0.0) ||
+        if ((e.kind == ForceKind::spring_damper && (e.rest > 0.0 || slack(e) > 0.0)) ||
             e.kind == ForceKind::coupling_spring)
             of_element_[6 * k] = count++;
         for (int i = 0; e.kind == ForceKind::bushing && i < 6; ++i)

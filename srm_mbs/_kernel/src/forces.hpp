@@ -48,7 +48,8 @@ struct Anchor {
     field(int, in_q)                 /* first index of the joint in q, and in v */         \
     field(int, in_v)                                                                       \
     field(bool, in_link_axes)        /* of a wrench: else world axes */                    \
-    /* Torque; force and moment; stiffness (6) and damping (6); lower and upper limit, depth. */ \
+    /* Torque; force and moment; stiffness (6) and damping (6); lower and upper limit, depth; of   \
+       springs nothing, or slack, of a coupling spring with friction and its speed. */         \
     field(std::vector<double>, numbers)                                                    \
     field(std::vector<Curve>, curves) /* laws of the numbers: none, one for all or one for each */
 
@@ -61,6 +62,19 @@ struct ForceElement {
 
 // Whether an element acts at points of links or on several joints, not on the coordinate of one.
 bool acts_on_several(const ForceElement& element);
+
+// Slack and friction of a spring.
+double slack(const ForceElement& element);
+double friction(const ForceElement& element);
+
+// A rate on which friction acts: a sum of velocity components, which are of joints or of a coupling
+// spring.
+struct FrictionSum {
+    std::vector<int> columns;
+    std::vector<double> coefficients;
+
+    double of(const double* v) const;
+};
 
 // Whether an element is a bushing that has a moment.
 bool turns(const ForceElement& element);

@@ -3,12 +3,13 @@
 #include <dlfcn.h>
 
 #include <stdexcept>
+#include <type_traits>
 
 namespace srm {
 
 namespace {
 
-constexpr int interface_version = 2;  // ABI in integration/generated/source.py
+constexpr int interface_version = 3;  // ABI in integration/generated/source.py
 
 // Places in srm_mbs_sizes.
 enum Size {
@@ -41,7 +42,20 @@ GeneratedTerms::GeneratedTerms(const std::string& path, const std::vector<double
         throw std::invalid_argument(path + " has another interface");
     terms_ = reinterpret_cast<Terms*>(find("srm_mbs_terms"));
     set_constants_ = reinterpret_cast<Constants*>(find("srm_mbs_constants"));
-    factor_ = reinterpret_cast<Factor*>(dlsym(handle, "srm_mbs_factor"));
+    if (const void* size = dlsym(handle, "srm_mbs_factors_size")) {
+        algebra_.size = *static_cast<const std::size_t*>(size);
+        const auto take = [&](auto& function, const char* name) {
+            function = reinterpret_cast<std::decay_t<decltype(function)>>(find(name));
+        };
+        take(algebra_.factor, "srm_mbs_factor");
+        take(algebra_.pivot_rows, "srm_mbs_pivot_rows");
+        take(algebra_.normal, "srm_mbs_normal");
+        take(algebra_.multiplier, "srm_mbs_multiplier");
+        take(algebra_.times_q, "srm_mbs_times_q");
+        take(algebra_.whiten_force, "srm_mbs_whiten_force");
+        take(algebra_.whiten_velocity, "srm_mbs_whiten_velocity");
+        take(algebra_.unwhiten, "srm_mbs_unwhiten");
+    }
     linearise_ = reinterpret_cast<Linearise*>(dlsym(handle, "srm_mbs_linearise"));
     set_linear_constants_ =
         linearise_ ? reinterpret_cast<Constants*>(find("srm_mbs_linear_constants")) : nullptr;

@@ -1,11 +1,31 @@
 // Terms of one mechanism from code that was generated for it: integration/generated.
 #pragma once
 
+#include <cstddef>
 #include <memory>
 #include <string>
 #include <vector>
 
 namespace srm {
+
+// The algebra of one mechanism on factors of its own, which lie in `size` bytes: integration/generated.
+// White vectors are in the order of its elimination.
+struct GeneratedAlgebra {
+    std::size_t size;
+    // M (nv, nv), f (nv,), bias (rows,), G (rows, nv): L^-1 f (nv,), G M^-1 f + bias (rows,), |R_kk|
+    // (rank,) and the squares of W's columns (rows,).  Not 0 where M is not positive definite.
+    int (*factor)(void*, const double*, const double*, const double*, const double*, double*,
+                  double*, double*, double*);
+    const int* (*pivot_rows)(const void*);  // place (nv,) of each pivot in white vectors, then others
+    // With the first `rank` pivots: Q R^-T Pi^T g, Pi R^-1 Q^T x, and Q x or Q^T x in place.
+    void (*normal)(const void*, int rank, const double* g, double* white);
+    void (*multiplier)(const void*, int rank, const double* white, double* g);
+    void (*times_q)(const void*, int rank, int transposed, double* white);
+    // L^-1 x, L^T x and L^-T x, in place.
+    void (*whiten_force)(const void*, double*);
+    void (*whiten_velocity)(const void*, double*);
+    void (*unwhiten)(const void*, double*);
+};
 
 // Constant after construction, so that threads may share it.
 class GeneratedTerms {
@@ -44,12 +64,8 @@ public:
     // Whether that was generated.
     bool linearises() const { return linearise_ != nullptr; }
     int held() const;
-    // The factorisation of a DenseProjection: M, f, bias; A_, U_, inverse_, white_force, gamma_, tau_,
-    // inverse_pivots_, row_squares_, order_.  Not 0 where M is not positive definite.
-    using Factor = int(const double*, const double*, const double*, double*, double*, double*,
-                       double*, double*, double*, double*, double*, int*);
     // Null where none was generated.
-    Factor* factor() const { return factor_; }
+    const GeneratedAlgebra* algebra() const { return algebra_.factor ? &algebra_ : nullptr; }
     // Throws std::invalid_argument for a system of other sizes.
     void check(int nq, int nv, int rows, int rank, int laws, int bodies) const;
 
@@ -67,7 +83,7 @@ private:
     Terms* terms_;
     Linearise* linearise_;
     Constants *set_constants_, *set_linear_constants_;
-    Factor* factor_;
+    GeneratedAlgebra algebra_{};
     const int* sizes_;
     std::vector<double> constants_, linear_constants_;
 };

@@ -20,6 +20,7 @@
 #include "errors.hpp"
 #include "interpreter.hpp"
 #include "linear.hpp"
+#include "manifold.hpp"
 #include "model.hpp"
 #include "run.hpp"
 #include "separated_rows.hpp"
@@ -109,6 +110,8 @@ void bind_structs(nb::module_& m) {
     bind_struct<DrivenRow>(m, "DrivenRow");
     bind_struct<SystemData>(m, "SystemData");
     bind_struct<SeparatedRows>(m, "SeparatedRows");
+    bind_struct<ClosingLimits>(m, "ClosingLimits");
+    bind_struct<ScaledRows>(m, "ScaledRows");
     bind_struct<Extension>(m, "Extension");
     bind_struct<DenseConstants>(m, "DenseConstants");
     bind_struct<BranchCurve>(m, "BranchCurve");
@@ -232,53 +235,55 @@ struct PySystem {
         return nb::make_tuple(owned_array(std::move(g)), owned_array(std::move(G), {rows, width}));
     }
 
-    // Newton's iteration from q (nq,) onto the first rows of the system, as many as `algebra` has,
-    // without motions of drives: newton() of dynamics/constraints/newton.py, not monotone.  Errors
-    // are over row_unit (rows,), steps the shortest ones in units (nv,); pivots below `cut` of the
-    // longest row are zero.  The last configuration, and the largest error there.
+    // close_loops() from q (nq,): the last configuration, and the largest error there.
     nb::tuple close(Algebra& algebra, const Array& row_unit, const Array& units, const Array& q,
-                    int evaluations, double tolerance, double rounding, double cut) {
-        const int rows = algebra.rows(), nv = system->nv, nq = system->nq;
-        if (system->driven() || rows > system->rows() || algebra.columns() != nv)
+                    const ClosingLimits& limits) {
+        const int rows = algebra.rows();
+        if (system->driven() || rows > system->rows() || algebra.columns() != system->nv)
             throw nb::value_error("the rows are not those of the algebra");
         const double* const over = vector_of(row_unit, rows, "row_unit");
-        const double* const unit = vector_of(units, nv, "units");
-        const double* const start = vector_of(q, nq, "q");
-        std::vector<double> at(nq + nv, 0.0), delta(2 * nv, 0.0), g(system->rows());
-        std::vector<double> G(static_cast<std::size_t>(system->rows()) * nv);
-        std::copy_n(start, nq, at.begin());
-        double error = std::numeric_limits<double>::infinity();
-        for (int k = 1; k <= evaluations; ++k) {
-            system->closures_at(0.0, at.data(), g.data(), G.data(), nv);
-            double size = 0.0, longest = 0.0;
-            for (int row = 0; row < rows; ++row) {
-                g[row] /= over[row];
-                size = std::isnan(g[row]) ? g[row] : std::max(size, std::abs(g[row]));
-                if (std::isnan(size)) break;
-            }
-            const bool stuck = 0.5 * error < size && size <= rounding;
-            error = size;
-            if (stuck || !(size > tolerance) || k == evaluations) break;
-            for (int row = 0; row < rows; ++row) {
-                double* const out = algebra.row(row);
-                double squares = 0.0;
-                for (const int j : algebra.support(row)) {
-                    out[j] = G[static_cast<std::size_t>(row) * nv + j] * (unit[j] / over[row]);
-                    squares += out[j] * out[j];
-                }
-                longest = std::max(longest, squares);
-            }
-            try {
-                algebra.factor_written(cut * std::sqrt(longest));
-            } catch (const EvaluationError&) {
-                break;
-            }
-            algebra.shortest(g.data(), delta.data());
-            for (int j = 0; j < nv; ++j) delta[j] *= -unit[j];
-            system->retract(at.data(), delta.data(), at.data());
-        }
-        at.resize(nq);
+        const double* const unit = vector_of(units, system->nv, "units");
+        vector_of(q, system->nq, "q");
+        std::vector<double> at = to_vector(q);
+        const double error = close_loops(*system, algebra, over, unit, limits, at);
         return nb::make_tuple(owned_array(std::move(at)), error);
+    }
+
+    // ScaledSampler::walk() of as many steps as there are reaches; its samples.  With the
+    // interpreter's lock held, so that threads may share the system.
+    nb::tuple walk(const ScaledRows& rows, Algebra& all, Algebra& loops, Algebra& in_units,
+                   const Array& q, bool sample_start, const Array& directions,
+                   const Array& reaches, std::optional<Array> first) {
+        ScaledSampler sampler(*system, rows, all, loops, in_units);
+        vector_of(q, system->nq, "q");
+        const std::size_t steps = count_of(reaches, directions, system->nv);
+        const double* along = first ? vector_of(*first, system->nv, "first") : nullptr;
+        WalkSamples found;
+        sampler.walk(to_vector(q), sample_start, static_cast<int>(steps), directions.data(),
+                     reaches.data(), along, found);
+        const std::size_t n = found.count;
+        const auto each = [&](const Algebra& algebra) {
+            return static_cast<std::size_t>(std::min(algebra.rows(), algebra.columns()));
+        };
+        return nb::make_tuple(
+            owned_array(std::move(found.configurations), {n, static_cast<std::size_t>(system->nq)}),
+            owned_array(std::move(found.pivots), {n, each(all)}),
+            owned_array(std::move(found.of_loops), {n, each(loops)}),
+            owned_array(std::move(found.largest)));
+    }
+
+    // ScaledSampler::open_norms() at `spreads` (n, nv) from q (nq,).
+    nb::tuple open_norms(const ScaledRows& rows, Algebra& all, Algebra& loops, Algebra& in_units,
+                         const Array& q, const Array& spreads) {
+        ScaledSampler sampler(*system, rows, all, loops, in_units);
+        vector_of(q, system->nq, "q");
+        const std::size_t nv = system->nv;
+        if (spreads.ndim() != 2 || spreads.shape(1) != nv)
+            throw nb::value_error("spreads are not rows of nv numbers");
+        std::vector<double> squares(system->rows()), uncancelled(2);
+        sampler.open_norms(to_vector(q), spreads.shape(0), spreads.data(), squares.data(),
+                           uncancelled.data());
+        return nb::make_tuple(owned_array(std::move(squares)), owned_array(std::move(uncancelled)));
     }
 
     // Forces (n, drives) of the drives, NaN where rows depend on each other.
@@ -296,20 +301,25 @@ struct PySystem {
 
     // Of n states: multipliers (n, rows), wrenches (n, closures, 6) and (n, joints, 6); see
     // System::reactions.
-    nb::tuple reactions(PySystem& all, const Array& scale, const Array& t, const Array& states) {
+    nb::tuple reactions(PySystem& all, const Array& scale, const std::vector<int>& kept,
+                        const Array& t, const Array& states) {
         const std::size_t n = count_of(t, states, state_size()), nx = state_size();
         const auto rows = static_cast<std::size_t>(all.system->rows());
         if (all.system.get() == system.get() || all.state_size() != state_size() ||
             all.system->joint_count() != system->joint_count() || scale.size() != rows)
             throw nb::value_error("the rows are not those of the mechanism");
+        if (system->constrained()) {
+            expect_size("kept", kept.size(), static_cast<std::size_t>(system->rows()));
+            expect_within("kept", kept, 0, static_cast<long>(rows) - 1);
+        }
         const std::size_t closures = all.system->closure_count(), joints = system->joint_count();
         std::vector<double> lam(n * rows), on_b(6 * n * closures), on_child(6 * n * joints);
         const double *times = t.data(), *x = states.data(), *scales = scale.data();
         const auto find = [&] {
             for (std::size_t i = 0; i < n; ++i) {
                 system->evaluate(times[i], x + i * nx, System::ZoneView{});
-                system->reactions(times[i], x + i * nx, *all.system, scales, lam.data() + i * rows,
-                                  on_b.data() + 6 * i * closures,
+                system->reactions(times[i], x + i * nx, *all.system, scales, kept,
+                                  lam.data() + i * rows, on_b.data() + 6 * i * closures,
                                   on_child.data() + 6 * i * joints);
             }
         };
@@ -464,11 +474,15 @@ void bind_system(nb::module_& m) {
         .def("jacobians", &PySystem::jacobians)
         .def("rows_at", &PySystem::rows_at)
         .def("close", &PySystem::close, nb::arg("algebra"), nb::arg("row_unit"), nb::arg("units"),
-             nb::arg("q"), nb::arg("evaluations"), nb::arg("tolerance"), nb::arg("rounding"),
-             nb::arg("cut"))
+             nb::arg("q"), nb::arg("limits"))
+        .def("walk", &PySystem::walk, nb::arg("rows"), nb::arg("all"), nb::arg("loops"),
+             nb::arg("in_units"), nb::arg("q"), nb::arg("sample_start"), nb::arg("directions"),
+             nb::arg("reaches"), nb::arg("first").none())
+        .def("open_norms", &PySystem::open_norms, nb::arg("rows"), nb::arg("all"),
+             nb::arg("loops"), nb::arg("in_units"), nb::arg("q"), nb::arg("spreads"))
         .def("drive_forces", &PySystem::drive_forces)
-        .def("reactions", &PySystem::reactions, nb::arg("all"), nb::arg("scale"), nb::arg("t"),
-             nb::arg("states"))
+        .def("reactions", &PySystem::reactions, nb::arg("all"), nb::arg("scale"),
+             nb::arg("kept"), nb::arg("t"), nb::arg("states"))
         .def("accelerations", &PySystem::accelerations, nb::arg("t"), nb::arg("states"))
         .def("smallest_values", &PySystem::smallest_values)
         .def("differences", &PySystem::differences, nb::arg("from"), nb::arg("to"))
@@ -967,8 +981,9 @@ struct PySteps {
         bool same = array.ndim() == shape.size();
         for (std::size_t i = 0; same && i < shape.size(); ++i)
             same = array.shape(i) == shape.begin()[i];
+        if (same) return;
         const std::string place = std::string("StepArrays.") + field;
-        if (!same) throw nb::value_error((place + " has another shape").c_str());
+        throw nb::value_error((place + " has another shape").c_str());
     }
 };
 

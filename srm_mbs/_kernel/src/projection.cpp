@@ -88,11 +88,6 @@ void Projection::hold(const double* normals, int count) {
     }
 }
 
-std::unique_ptr<Projection> make_generated_projection(int nv, int rows, int structural_rank,
-                                                      double sigma_ref) {
-    return make_dense_projection(nv, rows, structural_rank, sigma_ref);
-}
-
 std::unique_ptr<Projection> make_projection(int structural_rank, double sigma_ref,
                                             const Pattern& pattern, const std::string& choice) {
     const int nv = static_cast<int>(pattern.parents.size());

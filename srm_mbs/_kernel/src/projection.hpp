@@ -12,8 +12,6 @@
 #include <string>
 #include <vector>
 
-#include "generated.hpp"
-
 namespace srm {
 
 class Projection {
@@ -30,8 +28,6 @@ public:
     // forces f (nv,) and bias (rows,).  threshold < 0: none.
     void factor(const double* M, const double* f, const double* bias, double threshold);
 
-    // Takes generated code for the factorisation, of a projection made for it.
-    virtual void use_factor(GeneratedTerms::Factor*) {}
 
     // Keeps the motion tangential to the normals (count, nv), the weakest last, in place of the
     // rows that are not in use.
@@ -107,9 +103,5 @@ struct Pattern {
 // choice: "auto", "dense" or "sparse".
 std::unique_ptr<Projection> make_projection(int structural_rank, double sigma_ref,
                                             const Pattern& pattern, const std::string& choice);
-
-// A dense one that factorises by generated code.
-std::unique_ptr<Projection> make_generated_projection(int nv, int rows, int structural_rank,
-                                                      double sigma_ref);
 
 }  // namespace srm

@@ -86,19 +86,35 @@ void System::row_multipliers(const double* generalised, const std::vector<double
     for (int row = 0; row < rows; ++row) out[row] /= scale[row];
 }
 
+// Independent rows have one solution, which the factorisation of the stage has: lam = Pi R^-1 Q^T
+// L^T yhat, over the scales.
+bool System::kept_multipliers(const double* generalised, const double* scale,
+                              const std::vector<int>& kept, double* out) {
+    if (rank() != data_.rows || !data_.eliminations.empty()) return false;
+    std::copy(generalised, generalised + nv, white_.begin());
+    projection_->whiten_velocity(white_.data());
+    std::vector<double> own(data_.rows);
+    projection_->multiplier(white_.data(), own.data());
+    for (std::size_t k = 0; k < kept.size(); ++k) out[kept[k]] = own[k] / scale[kept[k]];
+    return true;
+}
+
 void System::reactions(double t, const double* state, System& all, const double* scale,
-                       double* multipliers, double* on_b, double* joints) {
+                       const std::vector<int>& kept, double* multipliers, double* on_b,
+                       double* joints) {
     auto& w = *work_;
     const int rows = all.data_.rows, count = w.model.njoints;
     std::vector<double> rate(2 * nv), generalised(nv);
     this->rate(rate.data());
     std::fill(multipliers, multipliers + rows, 0.0);
     if (closed_ && rows) {
-        // The last column is the derivative by time.
-        std::vector<double> G(static_cast<std::size_t>(rows) * (nv + 1), 0.0);
         multiplier(generalised.data());
-        all.write_rows(t, state, G.data(), nv + 1);
-        row_multipliers(generalised.data(), G, scale, rows, multipliers);
+        if (!kept_multipliers(generalised.data(), scale, kept, multipliers)) {
+            // The last column is the derivative by time.
+            std::vector<double> G(static_cast<std::size_t>(rows) * (nv + 1), 0.0);
+            all.write_rows(t, state, G.data(), nv + 1);
+            row_multipliers(generalised.data(), G, scale, rows, multipliers);
+        }
     }
     const double* const q = state;
     const double* const v = state + nq;

@@ -271,17 +271,22 @@ Stop Run::attempt(StepDecision& decision) {
 // ReversalSearch.late in integration/reversals.py.
 double Run::late_past_layers(const StepResult& r) const {
     double late = -inf;
-    const int nv = system.nv;
-    for (int i = 0; system.has_friction() && i < nv; ++i) {
-        const double speed = system.friction_tolerance(i, 0.0);
-        if (!std::isfinite(speed)) continue;
-        const double scale = std::max(memory.state_scale[nv + i], r.state_scale[nv + i]);
+    const std::size_t n = 2 * static_cast<std::size_t>(system.nv);
+    for (const FrictionSum& sum : system.friction_sums()) {
+        double tolerance = 0.0;
+        for (std::size_t k = 0; k < sum.columns.size(); ++k) {
+            const int i = system.nv + sum.columns[k];
+            const double scale = std::max(memory.state_scale[i], r.state_scale[i]);
+            tolerance += std::abs(sum.coefficients[k]) * step.norm.weight(i, scale);
+        }
         std::pair<double, double> stages(inf, -inf);
-        for (std::size_t at = i; at + 2 * nv < r.rates.size(); at += 2 * nv)
-            stages = {std::min(stages.first, r.rates[at]), std::max(stages.second, r.rates[at])};
-        late = std::max(late,
-                        late_past_layer(r.h, memory.rate[i], r.end_rate[i], stages, speed,
-                                        step.norm.weight(nv + i, scale), constants()));
+        for (std::size_t at = 0; at + n < r.rates.size(); at += n) {
+            const double rate = sum.of(r.rates.data() + at);
+            stages = {std::min(stages.first, rate), std::max(stages.second, rate)};
+        }
+        late = std::max(late, late_past_layer(r.h, sum.of(memory.rate.data()),
+                                              sum.of(r.end_rate.data()), stages,
+                                              system.friction_speed(), tolerance, constants()));
     }
     return late;
 }

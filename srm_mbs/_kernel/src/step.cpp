@@ -177,34 +177,43 @@ double SplitStep::stiffness() const {
     return h_ * std::min(da / dv, std::sqrt(da / dq));
 }
 
-// Whether the acceleration of a coordinate with friction varies over the step by more than what
-// would stop it within the step, and by more than the tolerance: stages take its sign at random.
+// Whether the derivative of a rate with friction varies over the step by more than what would stop
+// it within the step, and by more than the tolerance: stages take its sign at random.
 bool SplitStep::chatters(const IntegratorState& memory) const {
     const int s = scheme.stages(), n = n_;
-    if (!system_.has_friction()) return false;
-    for (int i = nv_; i < n; ++i) {
-        if (!std::isfinite(system_.friction_tolerance(i - nv_, 0.0))) continue;
-        const double before = std::abs(memory.rate[i - nv_]);
-        const double least = std::max({before, std::abs(result.end_rate[i - nv_]),
-                                       norm.weight(i, before)}) / h_;
-        double low = result.rates[i], high = low;
+    for (const FrictionSum& sum : system_.friction_sums()) {
+        double tolerance = 0.0;
+        for (std::size_t k = 0; k < sum.columns.size(); ++k) {
+            const int i = sum.columns[k];
+            tolerance +=
+                std::abs(sum.coefficients[k]) * norm.weight(nv_ + i, std::abs(memory.rate[i]));
+        }
+        const double least = std::max({std::abs(sum.of(memory.rate.data())),
+                                       std::abs(sum.of(result.end_rate.data())), tolerance}) / h_;
+        double low = sum.of(&result.rates[nv_]), high = low;
         for (int j = 1; j <= s; ++j) {
-            low = std::min(low, result.rates[j * n + i]);
-            high = std::max(high, result.rates[j * n + i]);
+            const double there = sum.of(&result.rates[j * n + nv_]);
+            low = std::min(low, there);
+            high = std::max(high, there);
         }
         if (high - low > least) return true;
     }
     return false;
 }
 
-// Error of the rate of a coordinate with friction that turns back within the step: the function of
-// that name in methods/stiffness.py.
-double SplitStep::reversal_error(const IntegratorState& memory, int i) const {
-    const double before = memory.rate[i], after = result.end_rate[i];
-    const double resolved = constants.unresolved * system_.friction_tolerance(i, 0.0);
-    if (!(before * after < 0.0 && std::abs(after - before) > resolved)) return 0.0;
-    const double jump = std::abs(result.end_rate[nv_ + i] - memory.rate[nv_ + i]);
-    return constants.reversal_share * h_ * jump;
+// Errors of the rates of coordinates on which friction acts that changes its sign within the step:
+// reversal_error in methods/stiffness.py.
+void SplitStep::add_reversal_errors(const IntegratorState& memory) {
+    for (const FrictionSum& sum : system_.friction_sums()) {
+        const double before = sum.of(memory.rate.data()), after = sum.of(result.end_rate.data());
+        const double resolved = constants.unresolved * system_.friction_speed();
+        if (!(before * after < 0.0 && std::abs(after - before) > resolved)) continue;
+        for (const int column : sum.columns) {
+            const int i = nv_ + column;
+            const double jump = std::abs(result.end_rate[i] - memory.rate[i]);
+            error_[i] = std::max(error_[i], constants.reversal_share * h_ * jump);
+        }
+    }
 }
 
 // Takes the step into account, which was accepted: methods/stiffness.py.
@@ -569,11 +578,15 @@ void SplitStep::estimate_error(const IntegratorState& memory, double sigma_chang
         error_[i] = h_ * std::abs(error_[i]);
         weights_[i] = norm.weight(i, std::max(memory.state_scale[i], r.state_scale[i]));
     }
-    for (int i = 0; system_.has_friction() && i < nv_; ++i)
-        error_[nv_ + i] = std::max(error_[nv_ + i], reversal_error(memory, i));
-    for (int i = 0; linear_ && i < nv_; ++i)
-        weights_[nv_ + i] =
-            std::min(weights_[nv_ + i], system_.friction_tolerance(i, r.end_rate[i]));
+    add_reversal_errors(memory);
+    if (linear_)
+        for (const FrictionSum& sum : system_.friction_sums()) {
+            const double size = system_.friction_tolerance(sum.of(r.end_rate.data()));
+            for (std::size_t k = 0; k < sum.columns.size(); ++k) {
+                double& weight = weights_[nv_ + sum.columns[k]];
+                weight = std::min(weight, size / std::abs(sum.coefficients[k]));
+            }
+        }
     if (monitored_) {
         // Counted always, the uncertainty of the predicted multiplier would shorten the steps next
         // to the singular configuration for ever.

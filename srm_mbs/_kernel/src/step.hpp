@@ -137,7 +137,7 @@ private:
     void linear_rate(int j, const std::vector<double>& laws);
     void apply_laws(int j);
     double stiffness() const;
-    double reversal_error(const IntegratorState& memory, int i) const;
+    void add_reversal_errors(const IntegratorState& memory);
     bool chatters(const IntegratorState& memory) const;
     void count_stiffness(IntegratorState& memory);
     void evaluate_stages(double t, const double* state, const IntegratorState& memory,

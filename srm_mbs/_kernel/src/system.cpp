@@ -212,6 +212,16 @@ System::System(const void* model, SystemData data, Controller controller)
     prediction_.resize(nv);
     white_.resize(nv);
     acted_.resize(nv);
+    find_friction();
+}
+
+void System::find_friction() {
+    friction_sums_.clear();
+    for (std::size_t i = 0; i < data_.friction.size(); ++i)
+        if (data_.friction[i] != 0.0) friction_sums_.push_back({{static_cast<int>(i)}, {1.0}});
+    for (const ForceElement& e : data_.forces)
+        if (e.kind == ForceKind::coupling_spring && friction(e) != 0.0)
+            friction_sums_.push_back({e.columns, e.signs});
 }
 
 System::~System() = default;
@@ -404,6 +414,7 @@ void System::renew(std::vector<double> unit, std::vector<double> residual_scale,
     data_.residual_scale = std::move(residual_scale);
     data_.damping = std::move(damping);
     data_.friction = std::move(friction);
+    find_friction();
     track_laws(false);
     held_from_.clear();
     held_.clear();
@@ -528,10 +539,8 @@ void System::passive_forces() {
     }
 }
 
-double System::friction_tolerance(int i, double v) const {
-    if (data_.friction.empty() || data_.friction[i] == 0.0)
-        return std::numeric_limits<double>::infinity();
-    return data_.friction_speed + friction_part * std::abs(v);
+double System::friction_tolerance(double rate) const {
+    return data_.friction_speed + friction_part * std::abs(rate);
 }
 
 bool System::time_dependent() const {
@@ -618,16 +627,17 @@ void System::use_code(const GeneratedTerms* code) {
     }
     code_ = code;
     if (!closed_) return;
-    GeneratedTerms::Factor* const factor = code ? code->factor() : nullptr;
-    if (factor && !generated_projection_)
-        generated_projection_ =
-            make_generated_projection(nv, data_.rows, data_.structural_rank, data_.sigma_ref);
-    if ((factor != nullptr) != uses_generated_projection_) {
-        std::swap(projection_, generated_projection_);
+    const GeneratedAlgebra* const algebra = code ? code->algebra() : nullptr;
+    if ((algebra != nullptr) != (by_code_ != nullptr)) {
+        // The other one waits in its place.
+        if (algebra && !other_projection_)
+            other_projection_ = std::make_unique<GeneratedProjection>(
+                nv, data_.rows, data_.structural_rank, data_.sigma_ref, *algebra);
+        std::swap(projection_, other_projection_);
         projection_->factorisations = 0;
-        uses_generated_projection_ = factor != nullptr;
+        by_code_ = algebra ? static_cast<GeneratedProjection*>(projection_.get()) : nullptr;
     }
-    if (factor) projection_->use_factor(factor);
+    if (algebra) by_code_->use(*algebra);
 }
 
 // M, the forces f and the rows of the closures, by generated code.
@@ -640,7 +650,11 @@ void System::generated_terms(double t, const double* state, ForceLaws* laws) {
             curve.at(t, s);
             law_values_[law++] = s[0];
         }
-    for (int row = 0; row < data_.rows; ++row) columns_of_rows_[row] = column(row);
+    double* const* rows = columns_of_rows_.data();
+    if (by_code_)
+        rows = by_code_->rows_for_code();
+    else
+        for (int row = 0; row < data_.rows; ++row) columns_of_rows_[row] = column(row);
     const bool joined = laws && !joined_.empty();
     if (joined) {
         passive_joined();
@@ -653,7 +667,7 @@ void System::generated_terms(double t, const double* state, ForceLaws* laws) {
                          laws && laws->applied ? laws->applied + first : nullptr,
                          w.data.M.data(), w.data.nle.data(), f_.data(), lawful,
                          held_values_.data(), own_laws_.data(), g_.data(), bias_.data(),
-                         columns_of_rows_.data(), bushing_bodies_.data(), w.data.J.data()))
+                         rows, bushing_bodies_.data(), w.data.J.data()))
         throw EvaluationError{Failure::coincident};
     if (laws) {
         std::copy(held_values_.begin(), held_values_.end(), laws->values.begin() + first);

@@ -19,6 +19,7 @@
 #include "curve.hpp"
 #include "forces.hpp"
 #include "generated.hpp"
+#include "generated_projection.hpp"
 #include "history.hpp"
 #include "projection.hpp"
 #include "struct_fields.hpp"
@@ -198,7 +199,9 @@ public:
 
     // The manifold.
     void retract(const double* state, const double* delta, double* out);
-    // Angles of (cos, sin) joints take the turn nearest to the motion near (nv,).
+    // Whether joints have angles of which only cosine and sine are known.
+    bool wraps() const { return !data_.wrapped_angles.empty(); }
+    // Such angles take the turn nearest to the motion near (nv,), which others do not need.
     void difference(const double* start, const double* end, const double* near, double* out);
     bool reachable(const double* start, const double* end) const;
     void chart_rate(const double* delta, const double* rate, double* out) const;
@@ -213,6 +216,11 @@ public:
     void closures_at(double t, const double* q, double* g, double* G, int width);
     // The entries of these rows that may differ from zero, into G.
     void write_rows(double t, const double* q, double* G, int width);
+    // The same rows, without those of drives, of a system without algebra of its own, and M (nv, nv)
+    // and the Jacobian J (6, nv) of the joints in the world, column by column (manifold.cpp).
+    void rows_and_mass(const double* q, double* G);
+    const double* mass_matrix() const;
+    const double* world_jacobian() const;
     // The coordinates that their differences may move together.
     const ColumnGroups& column_groups();
     int rows() const { return data_.rows; }
@@ -221,8 +229,6 @@ public:
     // `elements`, each by itself, at the rates of the state or, if it is `resting`, those of its
     // force at rest.
     void closure_errors(double t, const double* state, double* g, double* rates);
-    // Whether joints have angles of which only cosine and sine are known.
-    bool wraps() const { return !data_.wrapped_angles.empty(); }
     std::array<double, 2> energies(const double* state);
     void powers(double t, const double* state, const std::vector<ForceElement>& elements,
                 bool resting, double* out);
@@ -236,8 +242,10 @@ public:
     // rows; of its closures the wrenches (closures, 6) on b at b's origin; and of the joints those
     // (njoints, 6) of the parent on the child at the joint's origin: force, moment, in world axes.
     // Placements and velocities of the stage are the same afterwards, its other terms are lost.
+    // The rows that this system has are `kept` of these, in their order.
     void reactions(double t, const double* state, System& all, const double* scale,
-                   double* multipliers, double* on_b, double* joints);
+                   const std::vector<int>& kept, double* multipliers, double* on_b,
+                   double* joints);
     std::size_t closure_count() const { return data_.closures.size(); }
     int joint_count() const;
     void mass_times(const double* x, double* out) const;
@@ -279,9 +287,11 @@ public:
     void applied_forces(double t, const double* state, double* out);
     // Whether the laws, each of its own coordinate, are all that makes them depend on the state.
     bool separate_forces() const { return !controller_ && !on_several_; }
-    bool has_friction() const { return !data_.friction.empty(); }
-    // Error of the rate v of a coordinate from which its friction is another; infinite without.
-    double friction_tolerance(int i, double v) const;
+    // The rates on which friction acts, and the speed over which it changes its sign.
+    const std::vector<FrictionSum>& friction_sums() const { return friction_sums_; }
+    double friction_speed() const { return data_.friction_speed; }
+    // Error of a rate with friction, which is `rate`, from which the friction is another.
+    double friction_tolerance(double rate) const;
     // Whether rates may depend on time itself: held forces do not.
     bool time_dependent() const;
     const std::vector<GroupJoint>& groups() const { return data_.groups; }
@@ -295,6 +305,10 @@ public:
 private:
     Pattern pattern() const;
     void move_bodies(const double* state);
+    // Multipliers of the stage evaluated last, in the `kept` of all rows; false where rows depend
+    // on each other, or leave shares of others.
+    bool kept_multipliers(const double* generalised, const double* scale,
+                          const std::vector<int>& kept, double* out);
     // Those (rows,) of generalised forces of the closures (nv,), of rows G (rows, nv + 1).
     void row_multipliers(const double* generalised, const std::vector<double>& G,
                          const double* scale, int rows, double* out);
@@ -326,8 +340,8 @@ private:
     void joined_laws_by_state(const double* state, const double* a, double* out);
     void controller_by_state(double t, const double* state, const std::vector<double>& steps);
     const GeneratedTerms* code_ = nullptr;
-    std::unique_ptr<Projection> generated_projection_;  // or the other one, while it is in use
-    bool uses_generated_projection_ = false;
+    std::unique_ptr<Projection> other_projection_;  // that with generated algebra, or without it
+    GeneratedProjection* by_code_ = nullptr;        // the one in use, if its algebra is generated
     std::vector<double> law_values_;  // of the forces' curves, for generated code
     std::vector<double*> columns_of_rows_;
     std::vector<double*> bushing_bodies_;  // the memory of their kinematics
@@ -335,6 +349,9 @@ private:
     // Of generated derivatives, column by column: residuals by (q, v, laws), rows and laws by (q, v),
     // laws of coordinates by their own.
     std::vector<double> turns_, multipliers_, Dr_, Dc_, Dl_, Dq_, Dv_;
+    void find_friction();
+
+    std::vector<FrictionSum> friction_sums_;
     ForceLaws laws_;
     // Elements with laws, and the others, where the laws are joined.
     std::vector<ForceElement> lawful_, lawless_;

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,8 +13,10 @@ import pinocchio as pin
 from srm_mbs._kernel import core
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rheonomic import unscaled_rows
 from srm_mbs.dynamics.constraints.row_algebra import CompiledAlgebra, RowAlgebra
 from srm_mbs.dynamics.constraints.rows import COINCIDENT, LoopKinematics
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 _NO_NUMBERS = np.zeros(0)
 
@@ -56,7 +61,7 @@ class ClosureRows:
     """
 
     def __init__(self, model: pin.Model, rows: LoopKinematics) -> None:
-        self._model, self._rows, self._data = model, rows, workspace(model)
+        self._model, self._rows = model, rows
         self.g, self.G = rows.g, rows.G
         self._kernel: Any = None
         if core is None:
@@ -90,8 +95,12 @@ class ClosureRows:
         data = core.SystemData(**fields, **closure_structs(LoopKinematics.constants(rows)))
         self._kernel = core.System(model, data, None)
 
-    def evaluate(self, q: FloatArray) -> None:
-        """Evaluate g and G at the configuration q (nq,).
+    @cached_property
+    def _data(self) -> pin.Data:
+        return workspace(self._model)
+
+    def at(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """g and G at the configuration q (nq,).
 
         Raises
         ------
@@ -100,13 +109,24 @@ class ClosureRows:
         """
         if self._kernel is not None:
             try:
-                self.g, self.G = self._kernel.rows_at(0.0, np.ascontiguousarray(q))
+                return self._kernel.rows_at(0.0, np.ascontiguousarray(q))  # type: ignore[no-any-return]
             except ArithmeticError:
                 pass  # the reference raises the error that says why
-            else:
-                return
         self._rows.evaluate(self._model, self._data, q)
-        self.g, self.G = self._rows.g.copy(), self._rows.G.copy()
+        return self._rows.g.copy(), self._rows.G.copy()
+
+    def jacobians(self, q: FloatArray) -> FloatArray:
+        """G (n, m, nv) at n configurations q (n, nq), otherwise as :meth:`at`."""
+        if self._kernel is not None:
+            try:
+                return self._kernel.jacobians(np.zeros(len(q)), q)  # type: ignore[no-any-return]
+            except ArithmeticError:
+                pass
+        return np.array([self.at(each)[1] for each in q])
+
+    def evaluate(self, q: FloatArray) -> None:
+        """Evaluate g and G as :meth:`at`."""
+        self.g, self.G = self.at(q)
 
     def close(
         self,
@@ -114,8 +134,7 @@ class ClosureRows:
         row_unit: FloatArray,
         units: FloatArray,
         q: FloatArray,
-        evaluations: int,
-        **ends: float,
+        limits: Limits,
     ) -> tuple[FloatArray, float] | None:
         """Newton's iteration from q (nq,) onto the first rows, as many as ``algebra`` has, in one
         call of the kernel; None without it, and where the rows cannot be evaluated.
@@ -124,9 +143,8 @@ class ClosureRows:
         ----------
         row_unit : (rows,), units : (nv,)
             Errors over their units; steps are the shortest in those of the coordinates.
-        evaluations, ends
-            As for :func:`~srm_mbs.dynamics.constraints.newton.newton`, not monotone:
-            ``tolerance``, ``rounding``; ``cut``, pivots over the longest row that are zero.
+        limits
+            Where the iteration ends.
 
         Returns
         -------
@@ -137,7 +155,106 @@ class ClosureRows:
             return None
         try:
             return self._kernel.close(  # type: ignore[no-any-return]
-                algebra.compiled, row_unit, units, np.ascontiguousarray(q), evaluations, **ends
+                algebra.compiled, row_unit, units, np.ascontiguousarray(q), limits.compiled()
+            )
+        except ArithmeticError:
+            return None
+
+    def sampler(
+        self, algebras: Sequence[RowAlgebra | CompiledAlgebra], limits: Limits, **scaled: Any
+    ) -> CompiledSampler | None:
+        """Walks by the kernel over the rows; None without it.
+
+        Parameters
+        ----------
+        algebras
+            Of all rows and of those of the loops in the mass metric, and of the latter in units.
+        scaled
+            The other fields of ``ScaledRows`` (manifold.hpp).
+        """
+        compiled = [each.compiled for each in algebras if isinstance(each, CompiledAlgebra)]
+        if self._kernel is None or len(compiled) < len(algebras):
+            return None
+        made: Any = core
+        scaled_rows = made.ScaledRows(closing=limits.compiled(), **scaled)
+        return CompiledSampler(self._kernel, (scaled_rows, *compiled))
+
+
+@per_model
+def _shared_rows(mechanism: MechanismData) -> ClosureRows:
+    return ClosureRows(mechanism.model, unscaled_rows(mechanism).copy_workspace())
+
+
+def compiled_rows(mechanism: MechanismData) -> ClosureRows:
+    """All rows of a mechanism, unscaled and without the motions of its drives, for users of which
+    none keeps results in it."""
+    if core is not None:
+        return _shared_rows(mechanism)
+    return ClosureRows(mechanism.model, unscaled_rows(mechanism).copy_workspace())
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Where Newton's iteration onto closures ends, as for
+    :func:`~srm_mbs.dynamics.constraints.newton.newton`, not monotone.
+
+    Attributes
+    ----------
+    evaluations, tolerance, rounding
+        As there.
+    cut
+        Pivots below this part of the longest row are zero.
+    """
+
+    evaluations: int
+    tolerance: float
+    rounding: float
+    cut: float
+
+    def compiled(self) -> Any:
+        """The kernel's own."""
+        made: Any = core
+        return made.ClosingLimits(
+            evaluations=self.evaluations,
+            tolerance=self.tolerance,
+            rounding=self.rounding,
+            cut=self.cut,
+        )
+
+
+@dataclass(frozen=True)
+class CompiledSampler:
+    """Walks of the load-time analysis in one call of the kernel each, from
+    :meth:`ClosureRows.sampler`.  What they return is None where anything cannot be evaluated."""
+
+    kernel_system: Any
+    rows: tuple[Any, ...]
+
+    def walk(
+        self,
+        q: FloatArray,
+        sample_start: bool,
+        directions: FloatArray,
+        reaches: FloatArray,
+        first: FloatArray | None,
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
+        """See ``ScaledSampler::walk``: configurations (n, nq), pivots (n, k) of all rows and
+        (n, l) of those of the loops, and the largest norms (rows,) of rows."""
+        start = np.ascontiguousarray(q)
+        try:
+            return self.kernel_system.walk(  # type: ignore[no-any-return]
+                *self.rows, start, sample_start, directions, reaches, first
+            )
+        except ArithmeticError:
+            return None
+
+    def open_norms(
+        self, q: FloatArray, spreads: FloatArray
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """See ``ScaledSampler::open_norms``: sums (rows,) and (2,) over the spreads (n, nv)."""
+        try:
+            return self.kernel_system.open_norms(  # type: ignore[no-any-return]
+                *self.rows, np.ascontiguousarray(q), spreads
             )
         except ArithmeticError:
             return None

@@ -26,12 +26,18 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.projection import symmetric
-from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, all_rows
+from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, all_rows, unscaled_rows
 from srm_mbs.dynamics.constraints.rows import LoopKinematics, world_jacobian
 from srm_mbs.dynamics.constraints.structure import DEPENDENT, ROUNDING_ROW, structure_of
 from srm_mbs.dynamics.scaling import constraint_units, coordinate_units, row_units
 from srm_mbs.model.drives import in_order_of_rows, positions
 from srm_mbs.model.mechanism import MechanismData, per_model, per_start
+
+CLEARLY_MORE = 1e-12
+"""Mean square of the norm of a row, in units, above which it is no rounding: that of one without
+cancelled terms, 1e-24 of which is rounding, is at most nv^3 in a mechanism at the origin."""
+OPEN_SAMPLES = 8
+"""Random open configurations from which the usual norms of rows are measured."""
 
 
 class ClosureGeometry:
@@ -59,15 +65,30 @@ class ClosureGeometry:
     def __init__(self, mechanism: MechanismData, start: FloatArray) -> None:
         self.mechanism = mechanism
         self.start = start
-        # Gravity cancels in Gdot v, but its rounding would not at small rates.
-        self.model = mechanism.model.copy()
-        self.model.gravity.linear = np.zeros(3)
-        self.data = workspace(self.model)
-        self.rows = _loop_rows(mechanism).copy_workspace()
+        self.model = mechanism.model
         self.units = coordinate_units(mechanism, start, np.zeros(self.model.nv))
         self.unit = self.coordinate_unit = self.units.coordinate
         self.row_unit = row_units(mechanism, self.units)
         self.drives: tuple[str, ...] = ()
+
+    # Most starts are closed and regular by the kernel alone, which needs none of these.
+    @cached_property
+    def weightless(self) -> pin.Model:
+        """The model without gravity, which cancels in Gdot v, but whose rounding would not at small
+        rates."""
+        model = self.model.copy()
+        model.gravity.linear = np.zeros(3)
+        return model
+
+    @cached_property
+    def data(self) -> pin.Data:
+        """Pinocchio's workspace."""
+        return workspace(self.model)
+
+    @cached_property
+    def rows(self) -> LoopKinematics:
+        """The rows of the loops, unscaled."""
+        return loop_rows(self.mechanism).copy_workspace()
 
     def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """g over row units (rows,), and G over row units times coordinate units (rows, nv)."""
@@ -89,27 +110,64 @@ class ClosureGeometry:
         at_start = self.start is self.mechanism.q0
         return _row_size_at_start(self.mechanism) if at_start else self._measured_row_size()
 
+    @cached_property
+    def _open_configurations(self) -> FloatArray:
+        """Open configurations (n, nq), from which usual norms are measured."""
+        rng, model = np.random.default_rng(0), self.model
+        spreads = rng.uniform(-np.pi, np.pi, (OPEN_SAMPLES, model.nv)) * self.coordinate_unit
+        return np.array([pin.integrate(model, self.start, spread) for spread in spreads])
+
+    def _jacobians(self, q: FloatArray) -> FloatArray:
+        """G of :meth:`closure` (n, rows, nv) at n configurations q (n, nq)."""
+        return np.array([self.closure(each)[1] for each in q])
+
+    @cached_property
+    def _squares(self) -> FloatArray:
+        """Mean squares (rows,) of the norms of rows over the open configurations."""
+        G = self._jacobians(self._open_configurations)
+        squares: FloatArray = (G * G).sum(axis=(0, 2)) / len(G)
+        return squares
+
+    @cached_property
+    def _uncancelled(self) -> tuple[float, float]:
+        """The same, if no terms in rows cancelled, of one along a direction and of one of an
+        alignment: the rounding of a row is eps times its norm."""
+        model, places = self.model, self._open_configurations
+        J = np.empty((len(places), 6, model.nv))
+        for i, q in enumerate(places):
+            pin.computeJointJacobians(model, self.data, q)
+            J[i] = world_jacobian(self.data)
+        turn = np.linalg.norm(J[:, 3:], axis=1) * self.coordinate_unit
+        shift = np.linalg.norm(J[:, :3], axis=1) * self.coordinate_unit / self.units.length + turn
+        along, turning = ((each * each).sum() / len(places) for each in (shift, turn))
+        return float(along), float(turning)
+
+    @cached_property
+    def idle_rows(self) -> BoolArray:
+        """Which rows (rows,) are rounding in all open configurations: they are always satisfied, as
+        those out of the plane of a linkage."""
+        idle: BoolArray = self._squares == 0.0
+        if ((self._squares < CLEARLY_MORE) & ~idle).any():
+            whole, at = np.zeros(len(idle)), 0
+            for loop in self.mechanism.loops:
+                for block, size in zip(loop.rows.blocks, self._uncancelled):
+                    whole[at : at + loop.rows.count][block] = size
+                at += loop.rows.count
+            idle = self._squares <= ROUNDING_ROW**2 * whole
+        return idle
+
     def _measured_row_size(self) -> FloatArray:
-        rng = np.random.default_rng(0)
-        squares = np.zeros(len(self.row_unit))
-        uncancelled = np.zeros(2)
-        for _ in range(8):
-            spread = rng.uniform(-np.pi, np.pi, self.model.nv) * self.unit
-            _, G = self.closure(pin.integrate(self.model, self.start, spread))
-            squares += (G**2).sum(axis=1) / 8
-            # Norm of the rows if no terms in them cancelled: their rounding is eps times it.
-            J = world_jacobian(self.data)
-            turn = np.linalg.norm(J[3:], axis=0) * self.unit
-            shift = np.linalg.norm(J[:3], axis=0) * self.unit / self.units.length + turn
-            uncancelled += np.array([shift @ shift, turn @ turn]) / 8
-        at = 0
+        squares, at = self._squares.copy(), 0
         for loop in self.mechanism.loops:
             own = squares[at : at + loop.rows.count]
-            for block, whole in zip(loop.rows.blocks[:2], uncancelled):
+            for kind, block in enumerate(loop.rows.blocks[:2]):
                 if block.stop > block.start:
                     mean = own[block].mean()
-                    # Always satisfied: rounding must not be scaled up to a row.
-                    own[block] = mean if mean > ROUNDING_ROW**2 * whole else whole
+                    if not mean > CLEARLY_MORE and mean <= ROUNDING_ROW**2 * (
+                        whole := self._uncancelled[kind]
+                    ):
+                        mean = whole  # always satisfied: rounding must not be scaled up to a row
+                    own[block] = mean
             at += loop.rows.count
         return np.sqrt(np.where(squares > 0.0, squares, 1.0))
 
@@ -177,7 +235,7 @@ class ClosureGeometry:
 
     def bias(self, q: FloatArray, u: FloatArray) -> FloatArray:
         """Gdot v, rows over their usual size, for the rates u (nv,) in units."""
-        self.rows.evaluate(self.model, self.data, q, u * self.unit)
+        self.rows.evaluate(self.weightless, self.data, q, u * self.unit)
         return self.rows.bias / self.row_unit / self.row_size
 
     def mass(self) -> FloatArray:
@@ -206,8 +264,10 @@ class ClosureGeometry:
 
 
 @per_model
-def _loop_rows(mechanism: MechanismData) -> LoopKinematics:
+def loop_rows(mechanism: MechanismData) -> LoopKinematics:
     """The rows of the loops, unscaled; geometries copy their workspace."""
+    if not mechanism.drives:
+        return unscaled_rows(mechanism)
     return LoopKinematics(mechanism.model, mechanism.loops)
 
 
@@ -237,7 +297,11 @@ class DriveRows:
     """
 
     def __init__(self, mechanism: MechanismData, geometry: ClosureGeometry, q: FloatArray) -> None:
-        self._model, self._data, self._q = geometry.model, geometry.data, q
+        self.rows, self.rates = np.zeros((0, geometry.model.nv)), np.zeros(0)
+        self._kinematics: DrivenKinematics | None = None
+        if not mechanism.drives:
+            return
+        self._geometry, self._q = geometry, q
         self._unit = geometry.unit
         self._kinematics = DrivenKinematics(geometry.model, (), mechanism.drives)
         units = constraint_units(mechanism, geometry.units)
@@ -249,12 +313,15 @@ class DriveRows:
         ).reshape(-1, 3)
         self.rates = moving[:, 1] / self._row_unit
         self._accelerations = moving[:, 2] / self._row_unit
-        self._kinematics.evaluate(self._model, self._data, q)
+        self._kinematics.evaluate(geometry.model, geometry.data, q)
         self.rows = self._kinematics.G / self._row_unit[:, None] * self._unit
 
     def bias(self, u: FloatArray) -> FloatArray:
         """Gdot v - s'' (k,) for the rates u (nv,) in units."""
-        self._kinematics.evaluate(self._model, self._data, self._q, u * self._unit)
+        if self._kinematics is None:
+            return self.rates
+        geometry = self._geometry
+        self._kinematics.evaluate(geometry.weightless, geometry.data, self._q, u * self._unit)
         return self._kinematics.bias / self._row_unit - self._accelerations
 
 
@@ -312,7 +379,7 @@ class DrivenGeometry(ClosureGeometry):
     def bias(self, place: FloatArray, u: FloatArray) -> FloatArray:
         """Gdot v - s'' (dt)^2, rows over their usual size, for the rates u = (v, dt) in units."""
         rows, rates = self._rows, u * self.unit
-        rows.evaluate(self.model, self.data, place[:-1], rates[:-1])
+        rows.evaluate(self.weightless, self.data, place[:-1], rates[:-1])
         of_motion = rows.bias.copy()
         rows.move_to(float(place[-1]))
         whole: FloatArray = of_motion + (rows.bias - of_motion) * rates[-1] ** 2

@@ -132,7 +132,9 @@ class DrivenKinematics(LoopKinematics):
 
 
 @per_model
-def _all_rows(mechanism: MechanismData) -> DrivenKinematics:
+def unscaled_rows(mechanism: MechanismData) -> DrivenKinematics:
+    """All rows of a mechanism, unscaled and without the motions of its drives; only copies of their
+    workspace are evaluated."""
     return DrivenKinematics(mechanism.model, mechanism.loops, mechanism.drives)
 
 
@@ -144,7 +146,7 @@ def _idle_rows(mechanism: MechanismData) -> deque[tuple[DrivenKinematics, pin.Da
 
 def all_rows(mechanism: MechanismData) -> DrivenKinematics:
     """All rows of a mechanism, unscaled, with the motions of its drives and memory of their own."""
-    return _all_rows(mechanism).copy_workspace().follow(mechanism.drive_curves)
+    return unscaled_rows(mechanism).copy_workspace().follow(mechanism.drive_curves)
 
 
 def constraint_errors(
@@ -161,7 +163,7 @@ def constraint_errors(
     try:
         rows, data = idle.pop()  # two threads never get the same
     except IndexError:
-        rows, data = _all_rows(mechanism).copy_workspace(), workspace(model)
+        rows, data = unscaled_rows(mechanism).copy_workspace(), workspace(model)
     found = rows.follow(mechanism.drive_curves).errors(model, data, t, q, v)
     if model.nv <= LARGE:
         idle.append((rows, data))

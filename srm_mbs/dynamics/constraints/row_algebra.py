@@ -359,7 +359,7 @@ def row_algebra(pattern: BoolArray, model: pin.Model | None = None) -> RowAlgebr
 def _compiled(pattern: BoolArray, parents: Sequence[int], order: Sequence[int]) -> CompiledAlgebra:
     from srm_mbs._kernel import core
 
-    supports = [np.flatnonzero(p).tolist() for p in pattern]
+    supports = [[j for j, used in enumerate(row) if used] for row in pattern.tolist()]
     return CompiledAlgebra(
         core.Algebra(list(parents), supports, list(order), PIVOT_SHARE, PIVOT_WINDOW, "auto")  # type: ignore[union-attr]
     )
@@ -368,17 +368,19 @@ def _compiled(pattern: BoolArray, parents: Sequence[int], order: Sequence[int]) 
 def coordinate_parents(model: pin.Model) -> list[int]:
     """The next coordinate to the root of each velocity component (nv,); -1 at the root."""
     parents = [-1] * int(model.nv)
+    bodies, starts, sizes = (list(each) for each in (model.parents, model.idx_vs, model.nvs))
     for i in range(1, model.njoints):
-        joint, parent = model.joints[i], model.joints[int(model.parents[i])]
-        above = parent.idx_v + parent.nv - 1 if model.parents[i] else -1
-        for k in range(joint.idx_v, joint.idx_v + joint.nv):
+        parent = bodies[i]
+        above = starts[parent] + sizes[parent] - 1 if parent else -1
+        for k in range(starts[i], starts[i] + sizes[i]):
             parents[k], above = above, k
     return parents
 
 
 def trees(model: pin.Model) -> list[slice]:
     """Velocity components of each tree that is rooted in the ground: the blocks of M."""
-    starts = [model.joints[i].idx_v for i in range(1, model.njoints) if not model.parents[i]]
+    at, parents = list(model.idx_vs), list(model.parents)
+    starts = [at[i] for i in range(1, model.njoints) if not parents[i]]
     return [slice(a, b) for a, b in zip(starts, [*starts[1:], int(model.nv)])]
 
 

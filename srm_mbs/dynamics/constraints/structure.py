@@ -12,14 +12,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
-from srm_mbs.dynamics.constraints.compiled_rows import ClosureRows
+from srm_mbs.dynamics.constraints.compiled_rows import CompiledSampler, Limits, compiled_rows
 from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.constraints.projection import (
     PIVOT_ZERO,
@@ -29,7 +29,7 @@ from srm_mbs.dynamics.constraints.projection import (
     unwhiten,
     whiten,
 )
-from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
+from srm_mbs.dynamics.constraints.rheonomic import unscaled_rows
 from srm_mbs.dynamics.constraints.row_algebra import RowAlgebra, row_algebra, trees
 from srm_mbs.dynamics.constraints.rows import Elimination, world_jacobian
 from srm_mbs.dynamics.scaling import Units, coordinate_units, row_units
@@ -61,6 +61,10 @@ STUCK = 1e-9
 """Closure error, in row units, below which an iteration that gains nothing ends."""
 CLOSED = 1e-11
 """Closure error, in row units, below which a configuration is closed."""
+CLOSING_STEPS = 30
+"""Steps of Newton's iteration onto the closures."""
+HALVINGS = 8
+"""Lengths of a step of a walk that are tried, each half of the one before."""
 RESTARTS = 10
 """Number of walks from the start."""
 WALK_STEPS = 12
@@ -103,11 +107,10 @@ class ManifoldSampler:
     def __init__(self, mechanism: MechanismData, units: Units) -> None:
         self._mechanism = mechanism
         self.model = mechanism.model
-        self.data = workspace(self.model)
         self.units = units
         self.row_unit = row_units(mechanism, units)
-        rows = DrivenKinematics(self.model, mechanism.loops, mechanism.drives)
-        self._rows = ClosureRows(self.model, rows)
+        rows = unscaled_rows(mechanism)
+        self._rows = compiled_rows(mechanism)
         self.closed = len(self.row_unit)
         # From G to rows over their unit, of coordinates over theirs.
         self._to_units = units.coordinate / self.row_unit[:, None]
@@ -124,11 +127,15 @@ class ManifoldSampler:
         self._trees = trees(self.model)
         self._factorised: FloatArray | None = None
 
+    @cached_property
+    def data(self) -> pin.Data:
+        """Pinocchio's workspace, of the reference."""
+        return workspace(self.model)
+
     def _scaled(self, q: FloatArray) -> FloatArray:
         """G (rows, nv) of the rows after the eliminations, over their scale; M at q in ``data``."""
         pin.crba(self.model, self.data, q, pin.Convention.WORLD)
-        self._rows.evaluate(q)
-        G = self._rows.G
+        _, G = self._rows.at(q)
         if self.eliminations:
             G = G.copy()
         for row, other, factor in self.eliminations:
@@ -145,31 +152,24 @@ class ManifoldSampler:
             self._factorised = q
         return self._all, self._loops
 
-    def close(self, q: FloatArray, iterations: int = 30) -> tuple[FloatArray, float]:
+    def close(self, q: FloatArray, iterations: int) -> tuple[FloatArray, float]:
         """Newton's iteration onto the closure manifold by shortest steps in units; q and the
         largest error left, in row units."""
         if not self.closed:
             return q, 0.0
         found = self._rows.close(
-            self._in_units,
-            self.row_unit,
-            self.units.coordinate,
-            q,
-            iterations + 1,
-            tolerance=CLOSURE_ROUNDING,
-            rounding=STUCK,
-            cut=CLOSING_RANK,
+            self._in_units, self.row_unit, self.units.coordinate, q, _limits(iterations)
         )
         if found is not None:
             return found
         against, own = -self.units.coordinate, slice(self.closed)
 
         def linearise(q: FloatArray) -> tuple[float, Callable[[], FloatArray | None]]:
-            self._rows.evaluate(q)
-            g = self._rows.g[own] / self.row_unit
+            g, G = self._rows.at(q)
+            g = g[own] / self.row_unit
 
             def step() -> FloatArray | None:
-                by_unit = self._rows.G[own] * self._to_units
+                by_unit = G[own] * self._to_units
                 try:
                     longest = math.sqrt(np.einsum("ij,ij->i", by_unit, by_unit).max())
                     self._in_units.factor(None, by_unit, CLOSING_RANK * longest)
@@ -179,24 +179,47 @@ class ManifoldSampler:
 
             return float(np.abs(g).max()), step
 
+        limits = _limits(iterations)
         return newton(
             q,
             linearise,
-            iterations + 1,
-            tolerance=CLOSURE_ROUNDING,
-            rounding=STUCK,
+            limits.evaluations,
+            tolerance=limits.tolerance,
+            rounding=limits.rounding,
             monotone=False,
         )
 
-    def set_scale(self, rng: np.random.Generator) -> None:
-        """Row scales from open random configurations, isotropic per closure and kind of row."""
-        squares = np.zeros_like(self.scale)
-        uncancelled = np.zeros(2)
-        for _ in range(OPEN_SAMPLES):
-            spread = rng.uniform(-np.pi, np.pi, self.model.nv) * self.units.coordinate
+    def _compiled(self) -> CompiledSampler | None:
+        """Walks by the kernel, with the scale and the eliminations that there are now."""
+        rows, others, shares = zip(*self.eliminations) if self.eliminations else ((), (), ())
+        return self._rows.sampler(
+            (self._all, self._loops, self._in_units),
+            _limits(CLOSING_STEPS),
+            scale=self.scale,
+            row_unit=self.row_unit,
+            unit=self.units.coordinate,
+            length=self.units.length,
+            trees=[tree.start for tree in self._trees] + [int(self.model.nv)],
+            eliminated=list(rows),
+            others=list(others),
+            shares=np.array(shares, dtype=float),
+            null_pivot=NULL,
+            closed=CLOSED,
+            halvings=HALVINGS,
+        )
+
+    def _open_norms(self, spreads: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Sums over configurations that are ``spreads`` (n, nv) away from q0: squares (rows,) of
+        the norms of rows and, if no terms in rows cancelled, of one along a direction and of one of
+        an alignment (2,), of whose norms the rounding is eps times."""
+        compiled = self._compiled()
+        found = None if compiled is None else compiled.open_norms(self._mechanism.q0, spreads)
+        if found is not None:
+            return found
+        squares, uncancelled = np.zeros_like(self.scale), np.zeros(2)
+        for spread in spreads:
             rows, _ = self.factorised(pin.integrate(self.model, self._mechanism.q0, spread))
             squares += rows.row_squares
-            # Norm of the rows if no terms in them cancelled: their rounding is eps times it.
             J = world_jacobian(self.data)
             turn = np.linalg.norm(J[3:], axis=0)
             shift = np.linalg.norm(J[:3], axis=0) + self.units.length * turn
@@ -204,6 +227,12 @@ class ManifoldSampler:
                 U = cholesky(self.data.M[tree, tree])
                 mobility = (whiten(U, np.eye(len(U))) ** 2).sum(axis=0)
                 uncancelled += [mobility @ each[tree] ** 2 for each in (shift, turn)]
+        return squares, uncancelled
+
+    def set_scale(self, rng: np.random.Generator) -> None:
+        """Row scales from open random configurations, isotropic per closure and kind of row."""
+        spreads = rng.uniform(-np.pi, np.pi, (OPEN_SAMPLES, self.model.nv)) * self.units.coordinate
+        squares, uncancelled = self._open_norms(spreads)
         squares /= OPEN_SAMPLES
         uncancelled /= OPEN_SAMPLES
         at = 0
@@ -311,41 +340,129 @@ class ManifoldSampler:
         if not size > 0.0:
             return None
         move = direction * (reach / size)
-        for _ in range(8):
-            closed, error = self.close(pin.integrate(self.model, q, move))
+        for _ in range(HALVINGS):
+            closed, error = self.close(pin.integrate(self.model, q, move), CLOSING_STEPS)
             if error < CLOSED:
                 return closed
             move = 0.5 * move
         return None
 
-    def walk(
+    def samples(self, configurations: Iterable[FloatArray]) -> Samples:
+        """Pivots and norms of the rows at closed configurations."""
+        visited, pivots, of_loops = [], [], []
+        largest = np.zeros(len(self.scale))
+        for q in configurations:
+            rows, loops = self.factorised(q)
+            np.maximum(largest, np.sqrt(rows.row_squares), out=largest)
+            visited.append(q)
+            pivots.append(rows.pivots)
+            of_loops.append(loops.pivots)
+        return Samples(visited, np.array(pivots), np.array(of_loops), largest)
+
+    def explore(
         self,
         start: FloatArray,
         rng: np.random.Generator,
         restarts: int,
         steps: int,
         first: FloatArray | None = None,
-    ) -> Iterator[FloatArray]:
-        """Closed configurations of ``restarts`` random walks of ``steps`` steps from ``start``.
+        *,
+        sample_start: bool = False,
+    ) -> Samples:
+        """Samples on ``restarts`` random walks of ``steps`` steps from ``start``, which is closed
+        if it is to be a sample, the first one.
 
         The first steps of two of them go along the velocity ``first`` (nv,) and against it, unless
         it is zero.
         """
         along = [] if first is None or not first.any() else [first, -first]
+        compiled = self._compiled()
+        parts = []
         for restart in range(restarts):
-            q = start
+            directions, reaches = np.empty((steps, self.model.nv)), np.empty(steps)
             for k in range(steps):
-                # Drives may move: every closed configuration counts, driven there or not.
-                _, rows = self.factorised(q)
-                if rows.rank == self.model.nv:
-                    break
-                direction = rows.tangential(self._isotropic(rng.standard_normal(self.model.nv)))
-                if k == 0 and restart < len(along):
-                    direction = along[restart]
-                closed = self.step(q, direction, WALK_AMPLITUDE * rng.uniform(0.2, 1.0))
-                if closed is not None:
-                    q = closed
-                    yield q
+                rng.standard_normal(out=directions[k])
+                reaches[k] = WALK_AMPLITUDE * rng.uniform(0.2, 1.0)
+            draws = (
+                sample_start and restart == 0,
+                directions,
+                reaches,
+                along[restart] if restart < len(along) else None,
+            )
+            found = None if compiled is None else compiled.walk(start, *draws)
+            part = self.samples(self._walk(start, *draws)) if found is None else Samples(*found)
+            if len(part.configurations):
+                parts.append(part)
+        return Samples.joined(parts, len(self.scale))
+
+    def walk(
+        self, start: FloatArray, rng: np.random.Generator, restarts: int, steps: int
+    ) -> Sequence[FloatArray]:
+        """The closed configurations of :meth:`explore`."""
+        return list(self.explore(start, rng, restarts, steps).configurations)
+
+    def _walk(
+        self,
+        q: FloatArray,
+        sample_start: bool,
+        directions: FloatArray,
+        reaches: FloatArray,
+        first: FloatArray | None,
+    ) -> Iterator[FloatArray]:
+        """One walk of :meth:`explore`, as ``ScaledSampler::walk`` of the kernel has it.
+
+        Drives may move: every closed configuration counts, driven there or not.
+        """
+        if sample_start:
+            yield q
+        for k, (direction, reach) in enumerate(zip(directions, reaches)):
+            _, rows = self.factorised(q)
+            if rows.rank == self.model.nv:
+                return
+            if k == 0 and first is not None:
+                direction = first
+            else:
+                direction = rows.tangential(self._isotropic(direction))
+            closed = self.step(q, direction, reach)
+            if closed is not None:
+                q = closed
+                yield q
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Closed configurations (n, nq) and, there, the pivots (n, k) of all rows, those (n, l) of the
+    loops alone, and the largest norms (rows,) of rows."""
+
+    configurations: Sequence[FloatArray] | FloatArray
+    pivots: FloatArray
+    of_loops: FloatArray
+    largest: FloatArray
+
+    @classmethod
+    def joined(cls, parts: Sequence[Samples], rows: int) -> Samples:
+        """All samples of ``parts``, of ``rows`` rows."""
+        if not parts:
+            nothing = np.zeros((0, 0))
+            return cls([], nothing, nothing, np.zeros(rows))
+        configurations = [q for part in parts for q in part.configurations]
+        pivots = np.concatenate([part.pivots for part in parts])
+        of_loops = np.concatenate([part.of_loops for part in parts])
+        largest = np.max([part.largest for part in parts], axis=0)
+        return cls(configurations, pivots, of_loops, largest)
+
+    def ranks(self) -> IndexArray:
+        """The number (n,) of independent rows in each."""
+        return np.count_nonzero(self.pivots > STRUCTURAL_PIVOT, axis=1)  # type: ignore[no-any-return]
+
+    def last_pivots(self, rank: int) -> FloatArray:
+        """The last structural pivot in the configurations of that rank."""
+        return self.pivots[self.ranks() == rank, rank - 1]  # type: ignore[no-any-return]
+
+
+def _limits(iterations: int) -> Limits:
+    """Where Newton's iteration onto the closures ends: ``iterations`` steps at most."""
+    return Limits(iterations + 1, CLOSURE_ROUNDING, STUCK, CLOSING_RANK)
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,7 +510,8 @@ class Structure:
 
     def at(self, mechanism: MechanismData) -> Structure:
         """The same facts with the units of ``mechanism``, which differs in its start only."""
-        return replace(self, units=coordinate_units(mechanism, mechanism.q0, mechanism.v0))
+        units = coordinate_units(mechanism, mechanism.q0, mechanism.v0)
+        return self if units is self.units else replace(self, units=units)
 
     @property
     def redundant_rows(self) -> tuple[str, ...]:
@@ -406,50 +524,17 @@ class Structure:
         return int(np.sum(self.kept)) - self.rank
 
 
-def _closed(
+def _explored(
     mechanism: MechanismData, sampler: ManifoldSampler, rng: np.random.Generator
-) -> Iterator[FloatArray]:
+) -> Samples:
     """The closed configurations that the analysis looks at."""
     start, error = sampler.close(mechanism.q0, iterations=100)
-    if error < CLOSED:
-        yield start
-    else:
-        start = np.array(mechanism.q0)
-    yield from sampler.walk(start, rng, RESTARTS, WALK_STEPS, mechanism.v0)
+    closed = error < CLOSED
+    start = start if closed else np.array(mechanism.q0)
+    return sampler.explore(start, rng, RESTARTS, WALK_STEPS, mechanism.v0, sample_start=closed)
 
 
-@dataclass(frozen=True, eq=False)
-class _Samples:
-    """Closed configurations and, there, the pivots (n, k) of all rows, those (n, l) of the loops
-    alone, and the largest norms (rows,) of rows."""
-
-    configurations: list[FloatArray]
-    pivots: FloatArray
-    of_loops: FloatArray
-    largest: FloatArray
-
-    def ranks(self) -> IndexArray:
-        """The number (n,) of independent rows in each."""
-        return np.count_nonzero(self.pivots > STRUCTURAL_PIVOT, axis=1)  # type: ignore[no-any-return]
-
-    def last_pivots(self, rank: int) -> FloatArray:
-        """The last structural pivot in the configurations of that rank."""
-        return self.pivots[self.ranks() == rank, rank - 1]  # type: ignore[no-any-return]
-
-
-def _sampled(sampler: ManifoldSampler, configurations: Iterable[FloatArray]) -> _Samples:
-    visited, pivots, of_loops = [], [], []
-    largest = np.zeros(len(sampler.scale))
-    for q in configurations:
-        rows, loops = sampler.factorised(q)
-        np.maximum(largest, np.sqrt(rows.row_squares), out=largest)
-        visited.append(q)
-        pivots.append(rows.pivots)
-        of_loops.append(loops.pivots)
-    return _Samples(visited, np.array(pivots), np.array(of_loops), largest)
-
-
-def _balanced(sampler: ManifoldSampler, samples: _Samples, rank: int) -> _Samples:
+def _balanced(sampler: ManifoldSampler, samples: Samples, rank: int) -> Samples:
     """``samples`` after :meth:`ManifoldSampler.separate` and :meth:`ManifoldSampler.balance`; as
     they are, with their scale, if that does not raise the last pivot or makes more rows
     independent."""
@@ -459,7 +544,7 @@ def _balanced(sampler: ManifoldSampler, samples: _Samples, rank: int) -> _Sample
     measured = [samples.configurations[i] for i in chosen]
     sampler.separate(measured, samples.largest > ZERO_ROW)
     sampler.balance(measured)
-    again = _sampled(sampler, samples.configurations)
+    again = sampler.samples(samples.configurations)
     before = float(np.median(samples.last_pivots(rank)))
     if int(again.ranks().max()) == rank and np.median(again.last_pivots(rank)) > before:
         return again
@@ -493,8 +578,8 @@ def analyse(mechanism: MechanismData) -> Structure:
     rng = np.random.default_rng(0)
     sampler = ManifoldSampler(mechanism, units)
     sampler.set_scale(rng)
-    samples = _sampled(sampler, _closed(mechanism, sampler, rng))
-    if not samples.configurations:
+    samples = _explored(mechanism, sampler, rng)
+    if not len(samples.configurations):
         note = "no closed configuration was found: the loops do not close near the initial guess"
         kept = np.ones(len(names), dtype=bool)
         rank, loop_rank = (min(rows, mechanism.model.nv) for rows in (len(names), sampler.closed))
@@ -592,18 +677,17 @@ class ReusableAnalysis:
         return structure.at(mechanism)
 
 
-def _walked(structure: Structure, mechanism: MechanismData) -> _Samples | None:
+def _walked(structure: Structure, mechanism: MechanismData) -> Samples | None:
     """A walk of ``CHECKED_STEPS`` from the start of ``mechanism``, with the row scales of
     ``structure``; None if it contradicts the ranks and zero rows of that, or finds nothing."""
     rank = structure.rank
     sampler = ManifoldSampler(mechanism, coordinate_units(mechanism, mechanism.q0, mechanism.v0))
     sampler.scale, sampler.eliminations = structure.row_scale, structure.eliminations
-    start, error = sampler.close(mechanism.q0)
+    start, error = sampler.close(mechanism.q0, CLOSING_STEPS)
     if not rank or not error < CLOSED:
         return None
     rng = np.random.default_rng(0)
-    walk = sampler.walk(start, rng, 1, CHECKED_STEPS, mechanism.v0)
-    samples = _sampled(sampler, chain([start], walk))
+    samples = sampler.explore(start, rng, 1, CHECKED_STEPS, mechanism.v0, sample_start=True)
     loops = int((samples.of_loops > STRUCTURAL_PIVOT).sum(axis=1).max())
     if int(samples.ranks().max()) != rank or loops != structure.loop_rank:
         return None

@@ -49,9 +49,13 @@ def rpy(rotation: FloatArray) -> tuple[float, float, float]:
     return roll, math.atan2(-rest[2, 0], rest[2, 2]), math.atan2(-rest[0, 1], rest[1, 1])
 
 
+IDENTITY_ROUNDING = 1e-13
+"""Entries of a placement, m and rad, that are rounding of the identity's."""
+
+
 def is_identity(placement: pin.SE3) -> bool:
     """Whether a placement is the identity within rounding."""
-    return bool(placement.isIdentity(1e-13))
+    return bool(placement.isIdentity(IDENTITY_ROUNDING))
 
 
 def origin(parent: Element, placement: pin.SE3) -> None:

@@ -140,6 +140,8 @@ class Compiler:
     total_mass: float = -1.0
     groups: tuple[int, int] = (0, 5)
     mesh_folder: str = ""
+    in_world: bool = False
+    """Whether placements, axes and anchors are those in the world, in the pose of the file."""
     merges: bool = False
     """Whether the options of attached models act where those of the main file are the defaults."""
 

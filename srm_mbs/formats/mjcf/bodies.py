@@ -126,7 +126,17 @@ class BodyReader:
         if given.flag("mocap"):
             values.remark("a mocap body stays where the file has it", where)
         childclass = given.text("childclass", childclass)
-        in_parent = around * given.placement()
+        inside = pin.SE3.Identity()
+        if values.compiler.in_world:
+            at = (
+                given.placement()
+                if "pos" in given
+                else self._inertial_frame(node, name, childclass)
+            )
+            in_parent = around * at
+            inside = at.inverse()
+        else:
+            in_parent = around * given.placement()
         self.placements[name] = self.placements[parent] * in_parent
         found: dict[str, list[Any]] = defaultdict(list)
         self.bodies[name] = Body(name)
@@ -134,7 +144,7 @@ class BodyReader:
             self._moving.add(name)
         # Joints first: they precede those of nested bodies.
         self._joints(node, name, parent, in_parent, childclass)
-        self._contents(node, name, pin.SE3.Identity(), childclass, found)
+        self._contents(node, name, inside, childclass, found)
         self.bodies[name] = body = self._finished(name, found["inertial"], found["geom"])
         compensated = 0.0 if "gravcomp" in values.off else given.number("gravcomp")
         if compensated and body.inertia is not None and name in self._moving:
@@ -154,6 +164,10 @@ class BodyReader:
         for tag, what in REFUSED.items():
             if node.find(tag) is not None:
                 raise values.fault(where, f"<{tag}> ({what}) is not read", "Remove it")
+        for tag in ("frame", "replicate", "attach") if values.compiler.in_world else ():
+            if node.find(tag) is not None:
+                problem = f'<{tag}> is not read where coordinate="global"'
+                raise values.fault(where, problem, "Write the file in local coordinates")
         many = ("geom", "site", "body", "frame", "joint", "replicate", "attach")
         values.children(node, where, BODY_READ, BODY_IGNORED, many)
         for child in node:
@@ -262,6 +276,30 @@ class BodyReader:
                 raise given.fault("two sites have this name", "Rename one of them")
             self.sites[name] = (body, placement)
 
+    def _inertial_frame(self, node: Element, name: str, childclass: str) -> pin.SE3:
+        """The frame in the world of a body without ``pos``, in global coordinates: that of its
+        ``<inertial>``, else the centre of mass of its geoms with the axes of the world."""
+        values, around = self.values, pin.SE3.Identity()
+        inertial = node.find("inertial")
+        if inertial is not None:
+            return values.own(inertial, f"body {name!r}, <inertial>").placement()
+        found = [read_geom(values, geom, childclass, around, name) for geom in node.findall("geom")]
+        inertia = self._of_geoms(found)
+        if inertia is None:
+            problem = "it has neither a pos nor an inertia, which would place it"
+            raise values.fault(f"body {name!r}", problem, "Give pos")
+        return pin.SE3(np.eye(3), inertia.lever)
+
+    def _of_geoms(self, geoms: list[Geom]) -> pin.Inertia | None:
+        """Inertia of the geoms of a body; None without mass."""
+        inertia: pin.Inertia | None = None
+        low, high = self.values.compiler.groups
+        for geom in geoms:
+            part = inertia_of(geom, self.meshes, self.reach) if low <= geom.group <= high else None
+            if part is not None:
+                inertia = part if inertia is None else inertia + part
+        return inertia
+
     def _finished(
         self, name: str, inertials: list[tuple[Element, pin.SE3]], geoms: list[Geom]
     ) -> Body:
@@ -279,13 +317,7 @@ class BodyReader:
             node, around = inertials[0]
             inertia = around.act(_inertial(self.values.own(node, f"{where}, <inertial>")))
         elif use_geoms != "false":
-            low, high = compiler.groups
-            for geom in geoms:
-                part = (
-                    inertia_of(geom, self.meshes, self.reach) if low <= geom.group <= high else None
-                )
-                if part is not None:
-                    inertia = part if inertia is None else inertia + part
+            inertia = self._of_geoms(geoms)
         return Body(name, self._bounded(inertia), tuple(visuals))
 
     def _bounded(self, inertia: pin.Inertia | None) -> pin.Inertia | None:
@@ -313,6 +345,21 @@ class BodyReader:
             self.joints.append(Joint(rotor, "fixed", name, rotor))
             self.compensated[rotor] = 1.0
             self.values.remark("the armature of a free joint is a body without weight", rotor)
+
+    def add_armature(self, name: str, armature: float) -> None:
+        """Add to the armature of the joint ``name``."""
+        k = next(k for k, joint in enumerate(self.joints) if joint.name == name)
+        self.joints[k] = replace(self.joints[k], armature=self.joints[k].armature + armature)
+
+    def add_tendon(self, name: str, joint: str, armature: float) -> str:
+        """Add a joint that moves nothing but its armature, for the tendon ``name``, beside the body
+        that ``joint`` moves, and return its name."""
+        added = self._name(f"{name}::tendon", "")
+        carrier = next(one.child for one in self.joints if one.name == joint)
+        self.bodies[added] = Body(added)
+        self.placements[added] = self.placements[carrier]
+        self.joints.append(Joint(added, "prismatic", carrier, added, armature=armature))
+        return added
 
     def rescale(self) -> None:
         """Scale all inertias so that the total mass is ``settotalmass``."""
@@ -450,12 +497,15 @@ class BodyReader:
                 self.added[child] = armature
             self.free[child] = Joint(name, "floating", parent, child, at, **acting)
             return None
-        where_it_is = pin.SE3(np.eye(3), given.numbers("pos", 3, "0 0 0"))
+        in_body = pin.SE3.Identity()
+        if values.compiler.in_world:
+            in_body = self.placements[child].inverse()
+        where_it_is = pin.SE3(np.eye(3), in_body.act(given.numbers("pos", 3, "0 0 0")))
         placed = Joint(name, URDF_TYPES[kind], parent, child, at * where_it_is, where_it_is)
         if kind == "ball":
             self._spring(placed, acting.pop("stiffness"))
             return replace(placed, **acting)
-        x, y, z = given.direction("axis", "0 0 1").tolist()
+        x, y, z = (in_body.rotation @ given.direction("axis", "0 0 1")).tolist()
         in_si = values.angle if kind == "hinge" else float
         self.references[name] = ref = in_si(given.number("ref"))
         self.rests[name] = in_si(given.number("springref"))

@@ -150,6 +150,8 @@ class EqualityReader:
                 raise given.fault("it has no anchor", "Give it, in body1's frame")
             at = pin.SE3(np.eye(3), given.numbers("anchor", 3))
             placements = self.tree.placements
+            if self.values.compiler.in_world:
+                at = placements[first].inverse() * at
             ends = [(first, at), (second, placements[second].actInv(placements[first] * at))]
         self._close(name, "point", [(body, _point(at)) for body, at in ends], given)
 
@@ -294,29 +296,34 @@ class EqualityReader:
             if not (stiffness or damping or friction or armature):
                 values.ignore("<tendon> without stiffness or damping")
                 continue
+            rest = np.resize(given.numbers("springlength", (1, 2), "-1"), 2)
+            if rest[0] > rest[1]:
+                raise given.fault("its springlength decreases", "Exchange the two")
+            if node.tag == "fixed":
+                acting = {"stiffness": stiffness, "damping": damping, "friction": friction}
+                self._fixed_spring(name, node, where, acting, armature, rest)
+                continue
             ends = [child.get("site", "") for child in node if child.tag == "site"]
-            rest = given.numbers("springlength", (1, 2), "-1")
-            between = node.tag == "fixed" or len(node) == len(ends) == 2
             for refused, problem in (
-                (not between, "it is a spring or damper that does not go between two sites"),
-                (friction, "its frictionloss would act on several joints or along a line"),
-                (armature, "its armature would act on several joints or along a line"),
-                (np.ptp(rest) != 0.0, "its spring is slack between two lengths (springlength)"),
+                (
+                    not len(node) == len(ends) == 2,
+                    "it is a spring or damper that does not go between two sites",
+                ),
+                (friction, "its frictionloss would act along a line"),
+                (armature, "its armature would act along a line"),
             ):
                 if refused:
                     raise given.fault(
                         f"{problem}, which is not read by this version",
                         "Remove its stiffness, damping, frictionloss or armature",
                     )
-            if node.tag == "fixed":
-                self._fixed_spring(name, node, where, stiffness, damping, float(rest[0]))
-                continue
             (body_a, at_a), (body_b, at_b) = (self.site(end, where) for end in ends)
             length = float(rest[0])
             if length < 0.0:
                 places = self.tree.placements
                 apart = (places[body_a] * at_a).translation - (places[body_b] * at_b).translation
                 length = float(np.linalg.norm(apart))
+                rest[:] = length
             self.forces.append(
                 {
                     "type": "spring_damper",
@@ -326,14 +333,22 @@ class EqualityReader:
                     "stiffness": stiffness,
                     "damping": damping,
                     "rest_length": length,
+                    **_not_zero(slack=float(rest[1]) - length),
                 }
             )
 
     def _fixed_spring(
-        self, name: str, node: Element, where: str, stiffness: float, damping: float, rest: float
+        self,
+        name: str,
+        node: Element,
+        where: str,
+        acting: Mapping[str, float],
+        armature: float,
+        rest: FloatArray,
     ) -> None:
-        """The spring and damper of a fixed tendon, whose length is a sum of joint positions; by
-        default it is relaxed at the springrefs."""
+        """The spring, damper and friction ``acting`` in a fixed tendon, whose length is a sum of
+        joint positions; its spring is relaxed between the two lengths ``rest``, by default at the
+        springrefs."""
         references, factors = self.tree.references, self._coefficients(name, node)
         for joint in factors:
             if joint not in references:
@@ -341,20 +356,53 @@ class EqualityReader:
                 raise self.values.unknown(where, problem, references)
         terms = {joint: factor for joint, factor in factors.items() if factor}
         if not terms:
-            raise self.values.fault(where, "its spring acts on no joint", "Remove its stiffness")
-        if rest < 0.0:
-            rest = sum(factor * self.tree.rests[joint] for joint, factor in terms.items())
+            raise self.values.fault(where, "it acts on no joint", "Remove its stiffness")
+        if armature:
+            self._add_armature(name, terms, armature)
+        if not any(acting.values()):
+            return
+        low, high = rest.tolist()
+        if low == high == -1.0:
+            low = high = sum(factor * self.tree.rests[joint] for joint, factor in terms.items())
+        if acting["friction"]:
+            self.values.remark(
+                "frictionloss acts as smoothed Coulomb friction, not as MuJoCo's soft constraint",
+                where,
+            )
         self.forces.append(
             {
                 "type": "coupling_spring",
                 "name": name,
                 "joints": list(terms),
                 "coefficients": list(terms.values()),
-                "stiffness": stiffness,
-                "damping": damping,
-                "rest": rest - sum(terms[joint] * references[joint] for joint in terms),
+                "stiffness": acting["stiffness"],
+                "damping": acting["damping"],
+                "rest": low - sum(terms[joint] * references[joint] for joint in terms),
+                **_not_zero(slack=high - low, friction=acting["friction"]),
             }
         )
+
+    def _add_armature(self, name: str, terms: Mapping[str, float], armature: float) -> None:
+        """The armature of a fixed tendon: of its one joint, or of a joint of its own whose position
+        is the length of the tendon, from that at the references."""
+        if len(terms) == 1:
+            ((joint, factor),) = terms.items()
+            self.tree.add_armature(joint, factor**2 * armature)
+            return
+        joint = self.tree.add_tendon(name, next(iter(terms)), armature)
+        self.values.remark("the armature of a tendon acts on a joint of its own", joint)
+        self.loops.append(
+            {
+                "name": joint,
+                "type": "coupling",
+                "joints": [joint, *terms],
+                "coefficients": [1.0, *(-factor for factor in terms.values())],
+            }
+        )
+
+
+def _not_zero(**values: float) -> dict[str, float]:
+    return {key: value for key, value in values.items() if value}
 
 
 def _point(placement: pin.SE3) -> pin.SE3:

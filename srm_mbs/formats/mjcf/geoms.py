@@ -22,7 +22,7 @@ SIZES = {"sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3}
 """How many sizes each solid shape needs; radii and half lengths, m."""
 ALONG = ("capsule", "cylinder", "ellipsoid", "box")
 """Shapes that may be given by two ends."""
-MASSLESS = ("plane", "hfield")
+MASSLESS = ("plane",)
 INERTIAS = ("legacy", "convex", "exact", "shell")
 """Ways to the inertia of a mesh, the default first."""
 GIVE_INERTIAL = "Give the body an <inertial>"

@@ -209,11 +209,8 @@ def _compiler(values: MjcfValues, node: Element) -> None:
         given.flag(key)
     if "angle" in given:
         compiler.degrees = given.choice("angle", ("degree", "radian")) == "degree"
-    if given.choice("coordinate", ("local", "global")) == "global":
-        raise given.fault(
-            'coordinate="global" was removed from MuJoCo itself',
-            "Convert it: load and save it in MuJoCo 2.3.3 or older",
-        )
+    if "coordinate" in given:
+        compiler.in_world = given.choice("coordinate", ("local", "global")) == "global"
     compiler.sequence = given.text("eulerseq", compiler.sequence)
     if len(compiler.sequence) != 3 or not set(compiler.sequence) <= set("xyzXYZ"):
         raise given.fault(f"eulerseq is {compiler.sequence!r}", "Write three of xyzXYZ")

@@ -140,7 +140,7 @@ class Drawing:
             if bar.points.count(name) > 1:
                 raise fault(element, f"point {name!r} is named twice", "Name it once")
         for a, b in combinations(bar.points, 2):
-            if np.linalg.norm(self.points[a] - self.points[b]) <= COINCIDENT * self.size:
+            if self._apart(a, b) <= COINCIDENT * self.size:
                 raise fault(
                     element, f"the points {a!r} and {b!r} coincide", "Move one of them, or use one"
                 )
@@ -203,6 +203,15 @@ class Drawing:
 
     # -- geometry ----------------------------------------------------------------------------
 
+    @cached_property
+    def _places(self) -> dict[str, tuple[float, float]]:
+        """The points as plain numbers."""
+        return {name: (float(x), float(y)) for name, (x, y) in self.points.items()}
+
+    def _apart(self, a: str, b: str) -> float:
+        """Distance (m) of two points as drawn."""
+        return math.dist(self._places[a], self._places[b])
+
     def carriers(self, point: str) -> list[str]:
         """The bodies that have a point: the ground, bars, and sliders with mass."""
         return list(self._carriers[point])
@@ -222,12 +231,8 @@ class Drawing:
 
     def coinciding(self) -> list[tuple[str, str]]:
         """Pairs of different points at one place of the drawing."""
-        order = sorted(self.points, key=lambda name: tuple(self.points[name]))
-        return [
-            (a, b)
-            for a, b in pairwise(order)
-            if np.linalg.norm(self.points[a] - self.points[b]) <= COINCIDENT * self.size
-        ]
+        order = sorted(self.points, key=self._places.__getitem__)
+        return [(a, b) for a, b in pairwise(order) if self._apart(a, b) <= COINCIDENT * self.size]
 
     def direction(self, slider: PlanarSlider) -> float:
         """Angle (rad) of the line of a slider against x as drawn."""
@@ -246,6 +251,8 @@ class Drawing:
     def begin(self, bar: str, point: str) -> None:
         """Let a bar begin at one of its points."""
         points = self.bars[bar].points
+        if points[0] == point:
+            return
         others = [name for name in points if name != point]
         self.bars[bar] = self.bars[bar].model_copy(update={"points": [point, *others]})
         self._shapes[bar] = self._shape(self.bars[bar])
@@ -270,11 +277,11 @@ class Drawing:
 
     def _shape(self, bar: PlanarBar) -> FloatArray:
         """The points (n, 2) of a bar in its own axes."""
-        drawn = np.array([self.points[name] for name in bar.points])
         given = self._lengths(bar)
-        if len(drawn) == 2:
-            length = given.get((0, 1), float(np.linalg.norm(drawn[1] - drawn[0])))
+        if len(bar.points) == 2:
+            length = given.get((0, 1), self._apart(*bar.points))
             return np.array([[0.0, 0.0], [length, 0.0]])
+        drawn = np.array([self.points[name] for name in bar.points])
         with naming(element=f"bar {bar.name!r}"):
             return own_axes(fitted(drawn, given) if given else drawn)
 

@@ -15,7 +15,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
+from types import MappingProxyType
 from typing import Any
 from xml.etree.ElementTree import Element
 
@@ -26,8 +27,15 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError, known_names, naming
 from srm_mbs.formats.document import Document
-from srm_mbs.formats.graph.joint_graph import Body, Joint, components, distances, spanning_tree
-from srm_mbs.formats.graph.spanning_tree_to_urdf import anchor, closure, urdf_tree
+from srm_mbs.formats.graph.joint_graph import (
+    Body,
+    Joint,
+    SpanningTree,
+    components,
+    distances,
+    spanning_tree,
+)
+from srm_mbs.formats.graph.spanning_tree_to_urdf import IDENTITY_ROUNDING, closure, urdf_tree
 from srm_mbs.formats.planar.drawing import Drawing, fault, listed
 from srm_mbs.formats.planar.shapes import (
     GREY,
@@ -42,12 +50,15 @@ from srm_mbs.formats.planar.shapes import (
     slender,
     turned,
 )
+from srm_mbs.formats.planar.variants import model_of_variant, shape_of
 from srm_mbs.formats.toml.schema import PlanarEntry, PlanarSlider
 from srm_mbs.formats.translation import Options, Translation, urdf_text
 from srm_mbs.model.anchors import WORLD
 
 HINGE_AXIS = (0.0, -1.0, 0.0)
 """Axis of all pins, in the axes of the world."""
+KEPT_GRAPHS = 64
+"""Graphs of joints whose spanning trees are kept: variants of a linkage have the same."""
 WIDTH = 0.02
 """Width of a bar as it is drawn, over the size of the drawing."""
 LAW_VALUES: Mapping[str, tuple[str, ...]] = {
@@ -76,6 +87,30 @@ def translate(document: Document, options: Options) -> Translation:
         return _Linkage(options.planar, options).translation()
 
 
+@lru_cache(maxsize=KEPT_GRAPHS)
+def _levels(
+    bodies: tuple[str, ...], links: tuple[tuple[str, str], ...]
+) -> tuple[Mapping[str, int], tuple[str, ...]]:
+    """Number of links between the ground and each body, and the first bodies that are not connected
+    with it, if there are any."""
+    named = [Joint(str(k), "revolute", a, b) for k, (a, b) in enumerate(links)]
+    parts = components({name: Body(name) for name in bodies}, named)
+    loose = next((tuple(part) for part in parts if WORLD not in part), ())
+    return MappingProxyType({} if loose else distances(named, WORLD)), loose
+
+
+@lru_cache(maxsize=KEPT_GRAPHS)
+def _spanned(
+    joints: tuple[tuple[str, str, str, str, bool], ...], cut: tuple[str, ...]
+) -> SpanningTree:
+    """The spanning tree of joints: name, type, parent, child, and whether the tree keeps it."""
+    named = [
+        Joint(name, kind, parent, child, coupled=coupled)
+        for name, kind, parent, child, coupled in joints
+    ]
+    return spanning_tree(named, WORLD, cut)
+
+
 class _Linkage:
     """One linkage on its way from the drawing to the tree."""
 
@@ -99,27 +134,21 @@ class _Linkage:
 
     # -- the graph ---------------------------------------------------------------------------
 
-    def _depths(self) -> dict[str, int]:
+    def _depths(self) -> Mapping[str, int]:
         """Number of joints between the ground and each body."""
         links = [
-            Joint("", "revolute", a, b)
+            (a, b)
             for point in self.drawing.points
             for a in self.drawing.carriers(point)[:1]
             for b in self.drawing.carriers(point)[1:]
         ]
         links += [
-            Joint("", "slot", slider.on or WORLD, name)
+            (slider.on or WORLD, name)
             for slider in self.entry.slider
             for name in self.drawing.carriers(slider.point)
         ]
-        named = [replace(joint, name=str(k)) for k, joint in enumerate(links)]
-        loose = [
-            part
-            for part in components({name: Body(name) for name in self.bodies}, named)
-            if WORLD not in part
-        ]
-        if loose:
-            (first, *_) = loose
+        depths, first = _levels(tuple(self.bodies), tuple(links))
+        if first:
             one = len(first) == 1
             raise fault(
                 f"bar {first[0]!r}" if one else f"bars {listed(first)}",
@@ -128,21 +157,24 @@ class _Linkage:
                 else "nothing connects them with the ground",
                 "Give it a point of another bar, or one of its points to ground",
             )
-        return distances(named, WORLD)
+        return depths
 
     def _hub(self, bodies: list[str]) -> str:
         """The body nearest to the ground, which the others at a pin are joined with."""
         return min(bodies, key=lambda body: (self.depths[body], self.bodies.index(body)))
 
-    def _graph(self) -> Iterator[Joint]:
-        """Slides first: of joints that could be cut equally well, they stay in the tree."""
+    def _graph(self) -> Iterator[tuple[str, str, str, str]]:
+        """Name, type, parent and child of all joints.
+
+        Slides first: of joints that could be cut equally well, they stay in the tree.
+        """
         drawing = self.drawing
         for slider in self.entry.slider:
             if slider.mass:
-                yield Joint(slider.name, "prismatic", slider.on or WORLD, slider.name)
+                yield slider.name, "prismatic", slider.on or WORLD, slider.name
             else:
                 others = drawing.carriers(slider.point)
-                yield Joint(slider.name, "slot", slider.on or WORLD, self._hub(others))
+                yield slider.name, "slot", slider.on or WORLD, self._hub(others)
             self.points_of_joints[slider.name] = slider.point
         for point in drawing.points:
             bodies = drawing.carriers(point)
@@ -153,7 +185,7 @@ class _Linkage:
                 if body != hub:
                     name = point if len(bodies) == 2 else f"{point}:{body}"
                     self.points_of_joints[name] = point
-                    yield Joint(name, "revolute", hub, body)
+                    yield name, "revolute", hub, body
 
     @cached_property
     def _acted_on(self) -> dict[str, str]:
@@ -175,7 +207,7 @@ class _Linkage:
 
     def _tree(self) -> list[Joint]:
         graph = list(self._graph())
-        names = [joint.name for joint in graph]
+        names = [name for name, *_ in graph]
         for name in names:
             if names.count(name) > 1:
                 raise fault(
@@ -184,8 +216,8 @@ class _Linkage:
         for name, where in self._acted_on.items():
             if where and name not in names:
                 raise fault(where, f"there is no pin or slider {name!r}", known_names(names))
-        kept = [replace(joint, coupled=joint.name in self._acted_on) for joint in graph]
-        tree = spanning_tree(kept, WORLD, self.options.cut)
+        kept = tuple((*joint, joint[0] in self._acted_on) for joint in graph)
+        tree = _spanned(kept, tuple(self.options.cut))
         for joint in tree.cut:
             if joint.name in self._acted_on:
                 raise fault(
@@ -231,10 +263,10 @@ class _Linkage:
         return pin.SE3(np.eye(3), in_space(self._local(body, point)))
 
     def _anchor(self, body: str, point: str) -> dict[str, Any]:
-        place = self._at(body, point)
-        out = anchor(body, place)
-        out.pop("rpy", None)
-        return out
+        x, y = self._local(body, point).tolist()
+        if max(abs(x), abs(y)) <= IDENTITY_ROUNDING:
+            return {"link": body}
+        return {"link": body, "xyz": [x + 0.0, 0.0, y + 0.0]}
 
     def _carrier(self, point: str, element: str) -> str:
         """The body on which a point is fixed."""
@@ -273,22 +305,32 @@ class _Linkage:
             name: self._anchor(self._carrier(name, f"point {name!r}"), name)
             for name in drawing.points
         }
+        bodies, joints = self._parts
+        shape = shape_of(bodies, joints)
+        model = model_of_variant(self.options.known, shape, bodies, joints)
         return Translation(
-            self._urdf(drawn=False),
+            Element("robot") if model is not None else self._urdf(drawn=False),
             lambda: urdf_text(self._urdf(drawn=True)),
             entries,
             tuple(self._notes()),
             check=self._check,
+            shape=shape,
+            model=model,
         )
+
+    @cached_property
+    def _parts(self) -> tuple[list[Body], list[Joint]]:
+        """Bodies, without what is drawn, and the joints of the tree."""
+        bodies = [Body(name, self._inertia(name)) for name in self.bodies[1:]]
+        return bodies, list(map(self._placed, self.joints))
 
     def _urdf(self, drawn: bool) -> Element:
         """The tree; most of it is what is only ``drawn``."""
-        bodies = [
-            Body(name, self._inertia(name), self._visuals(name) if drawn else ())
-            for name in self.bodies[1:]
-        ]
+        bodies, joints = self._parts
+        if drawn:
+            bodies = [replace(body, visuals=self._visuals(body.name)) for body in bodies]
         name = self.options.own.get("name", "") or "linkage"
-        tree = urdf_tree(name, bodies, list(map(self._placed, self.joints)))
+        tree = urdf_tree(name, bodies, joints)
         if drawn:
             world = next(link for link in tree.findall("link") if link.get("name") == WORLD)
             world.extend(self._ground_visuals())
@@ -298,11 +340,11 @@ class _Linkage:
         """A joint of the tree with its frame on the parent; that on the child is the link's."""
         place = self._at(joint.parent, self._point(joint))
         if joint.type == "revolute":
-            return replace(joint, in_parent=place, axis=HINGE_AXIS)
+            return joint.placed(place, HINGE_AXIS)
         slider = self.drawing.sliders[joint.name]
         x, y, z = self._line(slider)
         axis = (x, y, z) if joint.child == slider.name else (-x, y, -z)
-        return replace(joint, in_parent=place, axis=axis)
+        return joint.placed(place, axis)
 
     def _inertia(self, body: str) -> pin.Inertia | None:
         drawing = self.drawing

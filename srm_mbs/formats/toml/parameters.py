@@ -12,6 +12,7 @@ import keyword
 import math
 import operator
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any
 
 from srm_mbs.errors import InputError, known_names, safe_repr
@@ -150,15 +151,20 @@ class _Parameters:
         """All values, in the order of the file."""
         return {name: self._value(name) for name in self._table}
 
-    def in_place(self, value: Any, key: str) -> Any:
-        """``value`` of ``key`` with numbers in place of its expressions."""
+    def in_place(self, value: Any, *key: str | int) -> Any:
+        """``value`` of ``key``, part by part, with numbers in place of its expressions."""
+        kind = type(value)
+        if kind is float or kind is int:
+            return value
         if is_expression(value):
             self.changed = True
-            return self._evaluated(value, key)
+            first, *parts = key
+            inside = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in parts)
+            return self._evaluated(value, f"{first}{''.join(inside)}")
         if isinstance(value, dict):
-            return {name: self.in_place(part, f"{key}.{name}") for name, part in value.items()}
+            return {name: self.in_place(part, *key, name) for name, part in value.items()}
         if isinstance(value, list):
-            return [self.in_place(part, f"{key}[{i}]") for i, part in enumerate(value)]
+            return [self.in_place(part, *key, i) for i, part in enumerate(value)]
         return value
 
     def _value(self, name: str) -> float:
@@ -205,7 +211,7 @@ class _Parameters:
                 remedy="Split it into several parameters",
             )
         try:
-            body = ast.parse(text[1:].strip(), mode="eval").body
+            body = _parsed(text)
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise InputError(
                 f"{shown} is not an expression",
@@ -279,6 +285,12 @@ class _Parameters:
                 remedy=f"Give it {wanted}",
             )
         return float(function(*arguments))
+
+
+@lru_cache(maxsize=MOST_PARAMETERS)
+def _parsed(text: str) -> ast.expr:
+    """The tree of an expression: variants of a description have the same."""
+    return ast.parse(text[1:].strip(), mode="eval").body
 
 
 _RESERVED = (*CONSTANTS, *FUNCTIONS)

@@ -30,6 +30,8 @@ from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
 
 def _number(value: Any) -> float:
+    if type(value) is float and abs(value) <= LARGEST_MAGNITUDE:
+        return value
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise PydanticCustomError("number", "a finite number is wanted")
     if not abs(value) <= LARGEST_MAGNITUDE:
@@ -281,16 +283,16 @@ class PlanarEntry(StrictEntry):
     points: dict[StrictStr, PlanePoint]
     bar: list[PlanarBar]
     ground: list[StrictStr]
-    slider: list[PlanarSlider] = []
-    length: list[PlanarLength] = []
+    slider: list[PlanarSlider] = pydantic.Field(default_factory=list)
+    length: list[PlanarLength] = pydantic.Field(default_factory=list)
     mass_per_length: NotNegative | None = None
     gravity: PlanePoint | None = None
-    start: dict[StrictStr, Number] = {}
-    rates: dict[StrictStr, Number] = {}
-    spring: list[PlanarSpring] = []
-    torque: list[PlanarTorque] = []
-    load: list[PlanarLoad] = []
-    drive: list[PlanarDrive] = []
+    start: dict[StrictStr, Number] = pydantic.Field(default_factory=dict)
+    rates: dict[StrictStr, Number] = pydantic.Field(default_factory=dict)
+    spring: list[PlanarSpring] = pydantic.Field(default_factory=list)
+    torque: list[PlanarTorque] = pydantic.Field(default_factory=list)
+    load: list[PlanarLoad] = pydantic.Field(default_factory=list)
+    drive: list[PlanarDrive] = pydantic.Field(default_factory=list)
 
 
 class OverrideEntry(StrictEntry):
@@ -327,7 +329,10 @@ class SimulationEntry(StrictEntry):
 
 
 class TopEntry(StrictEntry):
-    """A whole description."""
+    """A whole description.
+
+    Pydantic copies a default that can change, which takes longer than to make it.
+    """
 
     format: Literal[1]
     name: StrictStr = ""
@@ -335,21 +340,21 @@ class TopEntry(StrictEntry):
     sdf: StrictStr | None = None
     mjcf: StrictStr | None = None
     planar: PlanarEntry | None = None
-    parameters: dict[StrictStr, Number] = {}
-    cut: list[StrictStr] = []
+    parameters: dict[StrictStr, Number] = pydantic.Field(default_factory=dict)
+    cut: list[StrictStr] = pydantic.Field(default_factory=list)
     base: Base = "fixed"
     gravity: Vector = [0.0, 0.0, -9.81]
-    gravity_compensation: dict[StrictStr, Number] = {}
-    lock: list[StrictStr] = []
+    gravity_compensation: dict[StrictStr, Number] = pydantic.Field(default_factory=dict)
+    lock: list[StrictStr] = pydantic.Field(default_factory=list)
     massless: Massless = "refused"
     closing_tolerance: NotNegative = 0.0
     limits: Literal["reported", "spring"] = "reported"
     friction_speed: Positive = FRICTION_SPEED
-    loop: list[LoopEntry] = []
-    force: list[AnyForceEntry] = []
-    drive: list[DriveEntry] = []
-    points: dict[StrictStr, AnchorEntry] = {}
-    override: list[OverrideEntry] = []
-    actuators: dict[StrictStr, ActuatorEntry] = {}
-    initial: InitialEntry = InitialEntry()
-    simulation: SimulationEntry = SimulationEntry()
+    loop: list[LoopEntry] = pydantic.Field(default_factory=list)
+    force: list[AnyForceEntry] = pydantic.Field(default_factory=list)
+    drive: list[DriveEntry] = pydantic.Field(default_factory=list)
+    points: dict[StrictStr, AnchorEntry] = pydantic.Field(default_factory=dict)
+    override: list[OverrideEntry] = pydantic.Field(default_factory=list)
+    actuators: dict[StrictStr, ActuatorEntry] = pydantic.Field(default_factory=dict)
+    initial: InitialEntry = pydantic.Field(default_factory=InitialEntry)
+    simulation: SimulationEntry = pydantic.Field(default_factory=SimulationEntry)

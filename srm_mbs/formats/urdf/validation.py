@@ -12,6 +12,7 @@ import math
 import sys
 import warnings
 from collections.abc import Sequence
+from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -217,6 +218,14 @@ POINT_MASS_GYRATION_SQUARED = 1e-18
 """Square of the radius of gyration (m^2) below which it is rounding: a nanometre."""
 
 
+def doubtful_moments(principal: Any, mass: Any) -> tuple[Any, Any]:
+    """Whether principal moments (..., 3), ascending (kg m^2), of bodies of ``mass`` (...,) kg are
+    negative, and whether they violate the triangle inequality."""
+    least, middle, largest = np.moveaxis(principal, -1, 0)
+    rounding = 1e-9 * np.abs(principal).max(axis=-1) + POINT_MASS_GYRATION_SQUARED * mass
+    return least < -rounding, least + middle < largest - 1e-6 * largest - rounding
+
+
 class UrdfChecker(ElementChecker):
     """Walks a URDF once; raises :class:`InputError` at the first fault."""
 
@@ -298,10 +307,10 @@ class UrdfChecker(ElementChecker):
         moments = [self.number(inertia, key, where) for key in ATTRIBUTES["inertia"]]
         self._inertias[name] = inertia_at(origin_placement(inertial), value, moments)
         principal = np.linalg.eigvalsh(inertia_tensor(moments))
-        rounding = 1e-9 * float(np.abs(principal).max()) + POINT_MASS_GYRATION_SQUARED * value
-        if principal[0] < -rounding:
+        negative, impossible = doubtful_moments(principal, value)
+        if negative:
             self._negative[name] = principal[0]
-        elif principal[0] + principal[1] < principal[2] - 1e-6 * principal[2] - rounding:
+        elif impossible:
             self.warn(
                 f"link {name!r}: the principal moments of inertia {principal[0]:.3g}, "
                 f"{principal[1]:.3g}, {principal[2]:.3g} violate the triangle inequality: "

@@ -1,135 +1,494 @@
-"""The dense algebra of an evaluation as C, for sizes that are known when it is compiled.
+"""The dense algebra of an evaluation as C, for sizes and zeros that are known beforehand.
 
-It is ``DenseProjection::factorise`` of dense_projection.cpp: M = L L^T, W = L^-1 G^T and its QR
-with column pivoting, by the same rules for pivots and signs.  There the loops run along the columns
-of W, which are short and get shorter; here they run across them, over all rows of G at once, so
-that a processor's vectors are full and no loop has a remainder.  Columns are not exchanged: those
-that are done take part in later steps, where nothing reads them.
+It is that of ``DenseProjection`` (dense_projection.cpp), M = L L^T, W = L^-1 G^T, W Pi = Q R, by
+the same rules for pivots, and differs where that saves work:
+
+* Coordinates are eliminated from the leaves of the tree to its root, so that L has no entries that
+  M has not (Featherstone 2005, Int. J. Robotics Research 24:487), and a column of W only those of
+  the coordinates that move its row, and of their ancestors.  White vectors are in this order.
+* A reflection leads onto the largest entry of its column instead of the next row, which need not
+  have any.  Each column has a set of bits, the rows in which it may differ from zero: reflections
+  skip the others.
+* Loops run across the columns of W, over all rows of G at once, so that a processor's vectors are
+  full and no loop has a remainder.  Columns are not exchanged: those that are done take part in
+  later steps, where nothing reads them.
+* Norms of columns are updated, and computed again where that loses digits, as LAPACK's xGEQP3
+  does.
 """
 
 from __future__ import annotations
 
-SMALLEST = 3
-"""Coordinates from which it is generated: the kernel's loops over fewer are unrolled, too."""
-LARGEST = 48
-"""Coordinates or rows up to which it is generated: beyond them the kernel's sparse algebra costs
-less."""
+from collections.abc import Collection
+
+LARGEST = 64
+"""Coordinates or rows up to which it is generated: a set of rows has as many bits, and beyond it
+the kernel's sparse algebra costs less."""
 
 
-def algebra_of(nv: int, rows: int, rank: int) -> str:
-    """The C of the factorisation, or an empty text where there is none.
+LARGEST_UNROLLED = 8
+"""Coordinates up to which loops over them are unrolled, and nothing is skipped but what is zero
+beforehand."""
+
+
+def algebra_of(
+    nv: int,
+    rows: int,
+    rank: int,
+    mass: Collection[tuple[int, int]],
+    jacobian: Collection[tuple[int, int]],
+) -> str:
+    """The C of the factorisation and of the products with its factors, or an empty text where there
+    is none.
 
     Parameters
     ----------
     nv, rows, rank
         Coordinates, rows of G, and the structural rank.
+    mass
+        Pairs of coordinates whose entry of M may differ from zero, the smaller one first.
+    jacobian
+        Row and coordinate of the entries of G that the terms write; other rows are read whole.
     """
-    if rank == 0 or nv < SMALLEST or max(nv, rows) > LARGEST:
+    if rank == 0 or max(nv, rows) > LARGEST:
         return ""
-    sizes = f"enum {{ N = {nv}, ROWS = {rows}, RANK = {rank} }};"
-    return _FACTOR.replace("@SIZES@", sizes)
+    last = nv - 1
+    later: list[set[int]] = [set() for _ in range(nv)]  # columns of U in each of its rows
+    for i, j in mass:
+        if i != j:
+            later[last - j].add(last - i)
+    given = [sorted(columns) for columns in later]
+    for columns in later:
+        for i in columns:
+            later[i] |= {j for j in columns if j > i}
+    reach = [1 << k for k in range(nv)]  # the rows that elimination leads to from each
+    for k in reversed(range(nv)):
+        for i in later[k]:
+            reach[k] |= reach[i]
+    support = [0] * rows
+    for row, i in jacobian:
+        support[row] |= reach[last - i]
+    starts, columns_of_rows = [0], []
+    for columns in later:
+        columns_of_rows += sorted(columns)
+        starts.append(len(columns_of_rows))
+    unrolled = nv <= LARGEST_UNROLLED
+    entry = "U[{}][{}]" if unrolled else "AT(U[{}], {})"
+    values = {
+        "N": nv,
+        "ROWS": rows,
+        "RANK": rank,
+        "STARTS": ", ".join(map(str, starts)),
+        "LATER": ", ".join(map(str, columns_of_rows or [0])),
+        "REACH": ", ".join(f"{bits:#x}u" for bits in reach),
+        "SUPPORT": ", ".join(f"{bits:#x}u" for bits in support),
+        "SHORT": 0 if unrolled else 4,
+        "MASS": "\n".join(
+            f"  {entry.format(k, i)} = M[{(last - k) * nv + last - i}];"
+            for k in range(nv)
+            for i in (k, *given[k])
+        ),
+        "JACOBIAN": "\n".join(
+            f"  AT(X[{last - i}], {row}) = G[{row * nv + i}];" for row, i in sorted(jacobian)
+        ),
+        "OTHERS": "\n".join(f"  take_row(w, G, {row});" for row in range(rows) if not support[row]),
+    }
+    text = _HEAD + (_UNROLLED if unrolled else _SPARSE) + _SOLVES
+    for name, value in values.items():
+        text = text.replace(f"@{name}@", str(value))
+    return text
 
 
-_FACTOR = """
-@SIZES@
+_HEAD = """
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
 
-#if defined(__AVX512F__)
+#define N @N@
+#define ROWS @ROWS@
+#define RANK @RANK@
+#if defined(__AVX512F__) && ROWS > 4
 #define LANES 8
-#elif defined(__AVX__)
+#elif defined(__AVX__) && ROWS > 2
 #define LANES 4
 #else
 #define LANES 2
 #endif
 typedef double vec __attribute__((vector_size(8 * LANES)));
-enum { WIDE = (ROWS + LANES - 1) / LANES, HIGH = N / LANES + 1 };
+typedef long long flags __attribute__((vector_size(8 * LANES)));
+enum { WIDE = (ROWS + LANES - 1) / LANES, HIGH = (N + LANES - 1) / LANES, SHORT = @SHORT@ };
 #define EACH(b, count) _Pragma("GCC unroll 16") for (int b = 0; b < count; ++b)
+#define UNROLL(i, first, count) _Pragma("GCC unroll 8") for (int i = first; i < count; ++i)
+#define AT(x, i) (((double *)(x))[i])
+#define AT_ROWS(w) ((long long *)(w)->rows)
+/* A squared norm is computed again below this part of that which was computed last. */
+#define RESOLVED 1e-6
+/* The rows in a set of bits, one after the other. */
+#define IN(i, bits) (uint64_t rest_ = (bits); rest_; rest_ &= rest_ - 1) \\
+    for (int i = __builtin_ctzll(rest_), once_ = 1; once_; once_ = 0)
 
-/* From M and G (in A, row by row), f and bias: U with M = U^T U and the inverse of its diagonal,
- * L^-1 f, gamma = G M^-1 f + bias, the squares of W's columns, and in A, tau, inverse pivots and
- * order W Pi = Q R.  1 where M is not positive definite. */
-int srm_mbs_factor(const double *restrict M, const double *restrict f, const double *restrict bias,
-                   double *restrict A, double *restrict U, double *restrict inverse,
-                   double *restrict white, double *restrict gamma, double *restrict tau,
-                   double *restrict inverse_pivots, double *restrict row_squares,
-                   int *restrict order) {
-  vec X[N][WIDE], C[N][HIGH];  /* W; U and, in its column N, L^-1 f */
+/* White coordinates, rows of U and of W, are counted from the last coordinate to the first. */
+static const unsigned char later[] = {@LATER@};
+static const unsigned short starts[] = {@STARTS@};
+static const uint64_t reach[] = {@REACH@}, support[] = {@SUPPORT@};
+
+/* A factorisation.  X: W, then the rows of R, each at pivot_row; columns of R as in W. */
+typedef struct {
+  vec X[N][WIDE], U[N][HIGH], V[RANK][HIGH];  /* V: reflections; up to SHORT entries without gaps */
+  flags rows[WIDE];  /* of each column, those that may differ from zero */
+  double inverse[N], tau[RANK], inverse_pivot[RANK];
+  int order[ROWS], pivot_row[N];
+  unsigned char count[RANK], entry[RANK][SHORT + 1];  /* of the entries without gaps: their rows */
+} Factors;
+
+const size_t srm_mbs_factors_size = sizeof(Factors);
+
+/* A row of G of which any entry may differ from zero. */
+static inline void take_row(Factors *w, const double *G, int row) {
+  uint64_t bits = 0;
   for (int i = 0; i < N; ++i) {
-    double *const row = (double *)X[i], *const upper = (double *)C[i];
-    EACH(b, WIDE) X[i][b] = (vec){0};
-    EACH(b, HIGH) C[i][b] = (vec){0};
-    for (int j = 0; j < ROWS; ++j) row[j] = A[j * N + i];
-    for (int j = i; j < N; ++j) upper[j] = M[j * N + i];
-    upper[N] = f[i];
+    const double value = G[row * N + i];
+    AT(w->X[N - 1 - i], row) = value;
+    if (value != 0.0) bits |= reach[N - 1 - i];
   }
+  AT_ROWS(w)[row] = (long long)bits;
+}
+
+/* The column of the largest norm in the rows that are left, which is the next in `order`. */
+static inline __attribute__((always_inline)) int next_column(Factors *w, int k, vec *squares,
+                                                             vec *limits, uint64_t active) {
+  double *const square = (double *)squares, *const limit = (double *)limits, most = -1.0;
+  int best = k;
+  for (int n = k; n < ROWS; ++n) {
+    const int j = w->order[n];
+    if (square[j] < limit[j]) {
+      double sum = 0.0;
+      for IN(i, (uint64_t)AT_ROWS(w)[j] & active) sum += AT(w->X[i], j) * AT(w->X[i], j);
+      square[j] = sum;
+      limit[j] = RESOLVED * sum;
+    }
+    if (square[j] > most) most = square[j], best = n;
+  }
+  const int column = w->order[best];
+  w->order[best] = w->order[k];
+  w->order[k] = column;
+  return column;
+}
+
+/* gamma, the squares of W's columns, and where they are computed again; whether all are finite. */
+static inline int begin_columns(Factors *w, const vec *sums, const vec *squares, vec *limits,
+                                const double *bias, double *gamma, double *row_squares) {
+  int finite = 1;
+  EACH(b, WIDE) limits[b] = RESOLVED * squares[b];
+  for (int j = 0; j < ROWS; ++j) {
+    w->order[j] = j;
+    gamma[j] = AT(sums, j) + bias[j];
+    row_squares[j] = AT(squares, j);
+    finite &= row_squares[j] < INFINITY;
+  }
+  return finite;
+}
+
+/* From M, f, bias and G (rows, N): U with M = U^T U, L^-1 f, gamma = G M^-1 f + bias, the squares
+ * of W's columns, |R_kk|, and W Pi = Q R.  1 where M is not positive definite; the last pivot is
+ * not a number where W is not finite. */
+int srm_mbs_factor(void *work, const double *restrict M, const double *restrict f,
+                   const double *restrict bias, const double *restrict G, double *restrict white,
+                   double *restrict gamma, double *restrict pivots, double *restrict row_squares) {
+  Factors *const restrict w = work;
+  vec(*const X)[WIDE] = w->X, (*const V)[HIGH] = w->V;
+  vec sums[WIDE], squares[WIDE], limits[WIDE];
+  EACH(b, WIDE) sums[b] = squares[b] = (vec){0};
+  memset(X, 0, sizeof w->X);
+  for (int j = 0; j < ROWS; ++j) AT_ROWS(w)[j] = (long long)support[j];
+@JACOBIAN@
+@OTHERS@
+"""
+
+_SPARSE = """\
+  vec(*const U)[HIGH] = w->U;
+  memset(U, 0, sizeof w->U);
+@MASS@
+  for (int i = 0; i < N; ++i) white[i] = f[N - 1 - i];
   for (int k = 0; k < N; ++k) {
-    const double *const own = (const double *)C[k];
+    double *const own = (double *)U[k];
     const double pivot = own[k];
     if (!(pivot > 0.0)) return 1;
     const double diagonal = sqrt(pivot), by = 1.0 / diagonal;
-    inverse[k] = by;
-    vec x[WIDE], c[HIGH];
-    EACH(b, HIGH) C[k][b] = c[b] = C[k][b] * by;
-    EACH(b, WIDE) X[k][b] = x[b] = X[k][b] * by;
-    U[k * N + k] = diagonal;
-    for (int i = k + 1; i < N; ++i) {
+    w->inverse[k] = by;
+    const double force = white[k] *= by;
+    vec x[WIDE];
+    EACH(b, WIDE) {
+      X[k][b] = x[b] = X[k][b] * by;
+      sums[b] += force * x[b];
+      squares[b] += x[b] * x[b];
+    }
+    const int end = starts[k + 1];
+    if (starts[k] < end)
+      for (int b = k / LANES; b < HIGH; ++b) U[k][b] *= by;
+    own[k] = diagonal;
+    for (int n = starts[k]; n < end; ++n) {
+      const int i = later[n];
       const double u = own[i];
-      U[i * N + k] = u;
-      if (u == 0.0) continue;
-      EACH(b, HIGH) C[i][b] -= u * c[b];
+      white[i] -= u * force;
       EACH(b, WIDE) X[i][b] -= u * x[b];
+      for (int b = i / LANES; b < HIGH; ++b) U[i][b] -= u * U[k][b];
     }
   }
-  vec sums[WIDE], squares[WIDE];
-  EACH(b, WIDE) sums[b] = squares[b] = (vec){0};
-  for (int i = 0; i < N; ++i) {
-    const double w = white[i] = ((const double *)C[i])[N];
-    EACH(b, WIDE) {
-      sums[b] += w * X[i][b];
-      squares[b] += X[i][b] * X[i][b];
-    }
-  }
-  const double *const square = (const double *)squares;
-  for (int j = 0; j < ROWS; ++j) {
-    order[j] = j;
-    gamma[j] = ((const double *)sums)[j] + bias[j];
-    row_squares[j] = square[j];
-  }
+  const int finite = begin_columns(w, sums, squares, limits, bias, gamma, row_squares);
+  uint64_t active = ~(uint64_t)0 >> (64 - N);
   for (int k = 0; k < RANK; ++k) {
-    int best = k;
-    for (int j = k + 1; j < ROWS; ++j)
-      if (square[order[j]] > square[order[best]]) best = j;
-    const int column = order[best];
-    order[best] = order[k];
-    order[k] = column;
-    double *const v = A + k * N;
-    for (int i = 0; i < N; ++i) v[i] = ((const double *)X[i])[column];
-    double tails[4] = {0.0, 0.0, 0.0, 0.0};
-    for (int i = k + 1; i < N; ++i) tails[i & 3] += v[i] * v[i];
-    const double tail = (tails[0] + tails[1]) + (tails[2] + tails[3]), alpha = v[k];
-    double beta = alpha, t = 0.0;
-    if (tail != 0.0) {
-      beta = -copysign(sqrt(alpha * alpha + tail), alpha);
-      t = (beta - alpha) / beta;
-      const double scale = 1.0 / (alpha - beta);
-      for (int i = k + 1; i < N; ++i) v[i] *= scale;
-      v[k] = beta;
-    }
-    tau[k] = t;
-    inverse_pivots[k] = 1.0 / beta;
+    const int column = next_column(w, k, squares, limits, active);
+    const uint64_t own = (uint64_t)AT_ROWS(w)[column] & active;
+    int row = __builtin_ctzll(own ? own : active);
+    double alpha = 0.0, norm2 = 0.0;
     vec s[WIDE];
-    EACH(b, WIDE) s[b] = X[k][b];
-    for (int i = k + 1; i < N; ++i) EACH(b, WIDE) s[b] += v[i] * X[i][b];
-    EACH(b, WIDE) {
-      s[b] *= t;
-      X[k][b] -= s[b];
-      squares[b] = (vec){0};
+    EACH(b, WIDE) s[b] = (vec){0};
+    for IN(i, own) {
+      const double v = AT(X[i], column);
+      norm2 += v * v;
+      if (fabs(v) > fabs(alpha)) alpha = v, row = i;
+      EACH(b, WIDE) s[b] += v * X[i][b];
     }
-    for (int i = k + 1; i < N; ++i) EACH(b, WIDE) {
-      const vec left = X[i][b] - v[i] * s[b];
-      X[i][b] = left;
-      squares[b] += left * left;
+    const double beta = -copysign(sqrt(norm2), alpha), by = 1.0 / beta;
+    pivots[k] = fabs(beta);
+    w->inverse_pivot[k] = by;
+    w->pivot_row[k] = row;
+    w->count[k] = 0;
+    active &= ~((uint64_t)1 << row);
+    if (!(norm2 > 0.0)) continue;
+    w->tau[k] = (beta - alpha) * by;
+    /* R_kj = (W_k . W_j) / beta, and s = tau v . W_j = W_rj - R_kj, where that is more than
+     * rounding. */
+    EACH(b, WIDE) {
+      const vec old = X[row][b], moved = old - by * s[b];
+      const flags some = moved * moved > 1e-34 * squares[b];
+      s[b] = (vec)((flags)moved & some);
+      w->rows[b] |= some & (long long)own;
+      const vec R = X[row][b] = old - s[b];
+      squares[b] -= R * R;
+    }
+    const double scale = 1.0 / (alpha - beta);
+    const int count = __builtin_popcountll(own);
+    w->count[k] = (unsigned char)count;
+    if (count > SHORT) memset(V[k], 0, sizeof V[k]);
+    int n = 0;
+    for IN(i, own) {
+      const double v = i == row ? 1.0 : scale * AT(X[i], column);
+      if (count > SHORT) AT(V[k], i) = v;
+      else AT(V[k], n) = v, w->entry[k][n++] = (unsigned char)i;
+      if (i != row) EACH(b, WIDE) X[i][b] -= v * s[b];
     }
   }
+  int n = RANK;
+  for IN(i, active) w->pivot_row[n++] = i;
+"""
+
+_UNROLLED = """\
+  double U[N][N] = {{0}}, L[N][N], force[N];
+@MASS@
+  UNROLL(k, 0, N) force[k] = f[N - 1 - k];
+  /* M = L D L^T: its chain of operations has no roots. */
+  UNROLL(k, 0, N) {
+    if (!(U[k][k] > 0.0)) return 1;
+    const double by = 1.0 / U[k][k];
+    UNROLL(i, k + 1, N) if (reach[k] >> i & 1) {
+      const double l = L[k][i] = by * U[k][i];
+      force[i] -= l * force[k];
+      UNROLL(j, i, N) if (reach[k] >> j & 1) U[i][j] -= l * U[k][j];
+    }
+  }
+  UNROLL(k, 0, N) {
+    const double diagonal = sqrt(U[k][k]), by = 1.0 / diagonal;
+    w->inverse[k] = by;
+    white[k] = by * force[k];
+    AT(w->U[k], k) = diagonal;
+    UNROLL(i, k + 1, N) if (reach[k] >> i & 1) {
+      AT(w->U[k], i) = by * U[k][i];
+      EACH(b, WIDE) X[i][b] -= L[k][i] * X[k][b];
+    }
+    EACH(b, WIDE) {
+      const vec x = X[k][b] *= by;
+      sums[b] += white[k] * x;
+      squares[b] += x * x;
+    }
+  }
+  const int finite = begin_columns(w, sums, squares, limits, bias, gamma, row_squares);
+  EACH(b, WIDE) w->rows[b] = ~(flags){0};
+  UNROLL(k, 0, RANK) {
+    const int column = next_column(w, k, squares, limits, (uint64_t)((1 << N) - (1 << k)));
+    double v[N], norm2 = 0.0;
+    vec s[WIDE];
+    EACH(b, WIDE) s[b] = (vec){0};
+    UNROLL(i, k, N) {
+      v[i] = AT(X[i], column);
+      norm2 += v[i] * v[i];
+      EACH(b, WIDE) s[b] += v[i] * X[i][b];
+    }
+    const double alpha = v[k], beta = -copysign(sqrt(norm2), alpha), by = 1.0 / beta;
+    const double scale = norm2 > 0.0 ? 1.0 / (alpha - beta) : 0.0;
+    pivots[k] = fabs(beta);
+    w->inverse_pivot[k] = by;
+    w->tau[k] = norm2 > 0.0 ? (beta - alpha) * by : 0.0;
+    w->pivot_row[k] = k;
+    w->count[k] = N;
+    EACH(b, HIGH) V[k][b] = (vec){0};
+    AT(V[k], k) = 1.0;
+    UNROLL(i, k + 1, N) AT(V[k], i) = v[i] *= scale;
+    if (!(norm2 > 0.0)) continue;
+    EACH(b, WIDE) {
+      const vec R = by * s[b];
+      s[b] = X[k][b] - R;
+      X[k][b] = R;
+      squares[b] -= R * R;
+    }
+    UNROLL(i, k + 1, N) EACH(b, WIDE) X[i][b] -= v[i] * s[b];
+  }
+  UNROLL(k, RANK, N) w->pivot_row[k] = k;
+"""
+
+_SOLVES = """\
+  if (!finite) pivots[RANK - 1] = NAN;
   return 0;
+}
+
+/* Row of white coordinates that each pivot has; from the rank on, the others. */
+const int *srm_mbs_pivot_rows(const void *work) { return ((const Factors *)work)->pivot_row; }
+
+static inline double total(vec x) {
+#if LANES > 2
+  typedef double half __attribute__((vector_size(4 * LANES)));
+  half low, high;
+  memcpy(&low, &x, sizeof low);
+  memcpy(&high, (const char *)&x + sizeof low, sizeof high);
+  low += high;
+#else
+  const vec low = x;
+#endif
+#if LANES == 8
+  return (low[0] + low[2]) + (low[1] + low[3]);
+#else
+  return low[0] + low[1];
+#endif
+}
+
+static inline void reflect(const Factors *w, int k, double *restrict x) {
+  const double *const V = (const double *)w->V[k];
+  const int count = w->count[k];
+  if (count <= SHORT) {
+    const unsigned char *const at = w->entry[k];
+    double s = 0.0;
+    for (int n = 0; n < count; ++n) s += V[n] * x[at[n]];
+    s *= w->tau[k];
+    for (int n = 0; n < count; ++n) x[at[n]] -= s * V[n];
+    return;
+  }
+  vec sums[2] = {{0}};
+  EACH(b, HIGH) sums[b & 1] += w->V[k][b] * ((vec *)x)[b];
+  const double s = w->tau[k] * total(sums[0] + sums[1]);
+  EACH(b, HIGH) ((vec *)x)[b] -= s * w->V[k][b];
+}
+
+/* x = Q x, two reflections at a time, whose products with x do not wait for each other. */
+static inline void times_q(const Factors *w, int rank, vec *restrict x) {
+  int k = rank;
+  for (; k > 1; k -= 2) {
+    const vec *const a = w->V[k - 1], *const c = w->V[k - 2];
+    if (SHORT && (w->count[k - 1] <= SHORT || w->count[k - 2] <= SHORT)) {
+      reflect(w, k - 1, (double *)x);
+      reflect(w, k - 2, (double *)x);
+      continue;
+    }
+    vec first = {0}, second = {0}, both = {0};
+    EACH(b, HIGH) {
+      first += a[b] * x[b];
+      second += c[b] * x[b];
+      both += a[b] * c[b];
+    }
+    const double s = w->tau[k - 1] * total(first);
+    const double t = w->tau[k - 2] * (total(second) - s * total(both));
+    EACH(b, HIGH) x[b] -= s * a[b] + t * c[b];
+  }
+  if (k) reflect(w, 0, (double *)x);
+}
+
+/* x = Q x or, transposed, x = Q^T x, with the first `rank` reflections. */
+void srm_mbs_times_q(const void *work, int rank, int transposed, double *restrict white) {
+  const Factors *const w = work;
+  vec x[HIGH] = {{0}};
+  memcpy(x, white, N * sizeof *white);
+  if (transposed)
+    for (int k = 0; k < rank; ++k) reflect(w, k, (double *)x);
+  else
+    times_q(w, rank, x);
+  memcpy(white, x, N * sizeof *white);
+}
+
+/* white = Q R^-T Pi^T g */
+void srm_mbs_normal(const void *work, int rank, const double *restrict g, double *restrict white) {
+  const Factors *const w = work;
+  vec left[WIDE] = {{0}}, x[HIGH] = {{0}};
+  memcpy(left, g, ROWS * sizeof *g);
+  for (int k = 0; k < rank; ++k) {
+    const int row = w->pivot_row[k];
+    const double y = AT(left, w->order[k]) * w->inverse_pivot[k];
+    AT(x, row) = y;
+    EACH(b, WIDE) left[b] -= y * w->X[row][b];
+  }
+  times_q(w, rank, x);
+  memcpy(white, x, N * sizeof *white);
+}
+
+/* g = Pi R^-1 Q^T white */
+void srm_mbs_multiplier(const void *work, int rank, const double *restrict white,
+                        double *restrict g) {
+  const Factors *const w = work;
+  vec z[WIDE] = {{0}}, x[HIGH] = {{0}};
+  memcpy(x, white, N * sizeof *white);
+  for (int k = 0; k < rank; ++k) reflect(w, k, (double *)x);
+  for (int k = rank; k-- > 0;) {
+    const int row = w->pivot_row[k];
+    vec sum = {0};
+    EACH(b, WIDE) sum += w->X[row][b] * z[b];
+    AT(z, w->order[k]) = (AT(x, row) - total(sum)) * w->inverse_pivot[k];
+  }
+  memcpy(g, z, ROWS * sizeof *g);
+}
+
+/* x = L^-1 x, from coordinates to white ones. */
+void srm_mbs_whiten_force(const void *work, double *restrict x) {
+  const Factors *const w = work;
+  double t[N];
+  for (int k = 0; k < N; ++k) t[k] = x[N - 1 - k];
+  for (int k = 0; k < N; ++k) {
+    const double *const u = (const double *)w->U[k];
+    const double value = x[k] = t[k] * w->inverse[k];
+    for (int n = starts[k]; n < starts[k + 1]; ++n) t[later[n]] -= u[later[n]] * value;
+  }
+}
+
+/* x = L^T x, from coordinates to white ones. */
+void srm_mbs_whiten_velocity(const void *work, double *restrict x) {
+  const Factors *const w = work;
+  double t[N];
+  for (int k = 0; k < N; ++k) t[k] = x[N - 1 - k];
+  for (int k = 0; k < N; ++k) {
+    const double *const u = (const double *)w->U[k];
+    double sum = u[k] * t[k];
+    for (int n = starts[k]; n < starts[k + 1]; ++n) sum += u[later[n]] * t[later[n]];
+    x[k] = sum;
+  }
+}
+
+/* x = L^-T x, from white coordinates. */
+void srm_mbs_unwhiten(const void *work, double *restrict x) {
+  const Factors *const w = work;
+  double t[N];
+  for (int k = N; k-- > 0;) {
+    const double *const u = (const double *)w->U[k];
+    double sum = x[k];
+    for (int n = starts[k]; n < starts[k + 1]; ++n) sum -= u[later[n]] * t[later[n]];
+    t[k] = sum * w->inverse[k];
+  }
+  for (int k = 0; k < N; ++k) x[N - 1 - k] = t[k];
 }
 """

@@ -88,7 +88,7 @@ _NO_GENERATOR = ("code", "code_cache", "policy")
 """Modules of this package on which the source of a structure does not depend."""
 _libraries: OrderedDict[Structure, Library] = OrderedDict()
 _refused: dict[Structure, str] = {}
-"""Why no code can be generated for a structure: finding out may take a second."""
+"""Why no code can be generated for a structure, of up to KEPT: finding out may take a second."""
 _lock = Lock()
 _arrivals = 0
 
@@ -212,6 +212,8 @@ def source_of_structure(structure: Structure) -> Source:
                 f"it would have {source.operations} statements, more than {MOST_OPERATIONS}"
             )
     except UnsupportedElementError as error:
+        if len(_refused) >= KEPT:
+            _refused.clear()
         _refused[structure] = str(error)
         raise _not_generated(str(error)) from error
     return source

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from srm_mbs.integration.generated.algebra import algebra_of
@@ -10,7 +12,7 @@ from srm_mbs.integration.generated.linearisation import linearisation_of
 from srm_mbs.integration.generated.structure import Structure
 from srm_mbs.integration.generated.terms import record_terms
 
-ABI = 2
+ABI = 3
 """Version of the functions that the kernel calls: ``interface_version`` in generated.cpp."""
 
 
@@ -25,8 +27,8 @@ def source_of(structure: Structure) -> Source:
     """The C source of the terms of ``structure``.
 
     It defines ``srm_mbs_sizes``, the sizes of its arguments; ``srm_mbs_constants``, which computes
-    k from the parameters p; ``srm_mbs_terms``, of an evaluation; ``srm_mbs_factor``, its algebra;
-    and, for stiff steps, ``srm_mbs_linearise`` with constants of its own (generated.hpp).
+    k from the parameters p; ``srm_mbs_terms``, of an evaluation; ``srm_mbs_factor`` and others, its
+    algebra; and, for stiff steps, ``srm_mbs_linearise`` with constants of its own (generated.hpp).
 
     Raises
     ------
@@ -45,8 +47,20 @@ def source_of(structure: Structure) -> Source:
     text = _TEMPLATE.format(
         sizes=", ".join(map(str, sizes)), constants=written.constants, terms=written.terms
     )
-    text += algebra_of(structure.nv, structure.rows, structure.rank) + linear.text
+    text += _algebra(structure, [output.target for output in recorded.outputs]) + linear.text
     return Source(text, written.operations + linear.operations)
+
+
+def _algebra(structure: Structure, targets: Sequence[str]) -> str:
+    """The algebra for the entries of M and G among the ``targets`` of the terms."""
+    mass, jacobian = set(), set()
+    for target in targets:
+        name, *places = re.findall(r"\w+", target)
+        if name == "M":
+            mass.add(divmod(int(places[0]), structure.nv)[::-1])
+        elif name == "G":
+            jacobian.add((int(places[0]), int(places[1])))
+    return algebra_of(structure.nv, structure.rows, structure.rank, mass, jacobian)
 
 
 _TEMPLATE = """\

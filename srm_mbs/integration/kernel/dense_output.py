@@ -125,6 +125,8 @@ class CompiledDenseOutput(DenseOutput):
             return True  # loaded without the controller: no stage is to be evaluated
         # In a step between two breakpoints the state follows from extra stages, which have no zone
         # in the kernel.
+        if not len(steps.breaks):
+            return steps.count < 2 and bool(steps.between_nodes)
         intervals = (steps.smooth_interval(step) for step in steps.between_nodes)
         return any(last - first < 2 for first, last in intervals)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import ControllerError, EvaluationError, EventError
 from srm_mbs.integration import driver
@@ -45,16 +46,22 @@ class CompiledRecord(RunRecord):
 
     def suspect_times(self) -> list[float]:
         """Ends (s) of steps that were accepted although they may have changed the branch."""
-        return list(self._suspects if self.run is None else self.run.suspect_times())
+        return list(self._suspects if self.run is None else self.run.core.suspect_times())
 
     def close(self) -> None:
         """Let go of the run, which refers to a workspace; its steps remain."""
-        self._suspects, self._records = self.run.suspect_times(), self._take_records()
+        self._suspects, self._records = self.run.core.suspect_times(), self._take_records()
         self.run = None
 
     def _take_records(self) -> Any:
         start = (self.t0, self.x0) if self.rest is None else self.rest
-        return self.run.take_records(*start)
+        return self.run.core.take_records(*start)
+
+    def nodes(self) -> tuple[FloatArray, FloatArray] | None:
+        """Times (n + 1,) s and states (n + 1, nx) at the ends of the steps, without a terminal
+        event; None before :meth:`close`."""
+        records = self._records
+        return None if records is None else (records.times, records.states)
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""
@@ -95,15 +102,16 @@ def integrate(
     record = CompiledRecord(run.t0, start, run=run)
     started = time.perf_counter()
     one_by_one = tick is not None or events is not None
+    core = run.core
     try:
         if events is not None:
             events.begin(run.t0, start)
         reason = ReturnReason.CHUNK_FULL
         while reason is not ReturnReason.FINISHED:
-            if sink is not None and run.count >= sink.block:
+            if sink is not None and core.count >= sink.block:
                 sink.take(record.data(run.method.scheme, system.tangent_size))
-                record.rest = run.t, run.state
-            made = run.count if one_by_one or sink is not None else 0
+                record.rest = core.t, core.state
+            made = core.count if one_by_one or sink is not None else 0
             stride = getattr(tick, "stride", 1) if events is None else 1  # a tick may change it
             block = 0 if sink is None else sink.block - made
             reason = run.advance(stride if one_by_one else block)
@@ -117,31 +125,32 @@ def integrate(
                 continue
             if reason not in (ReturnReason.CHUNK_FULL, ReturnReason.FINISHED):
                 failure = why_stopped(reason, system, run)
-                record.mark_failed(failure, run.t, run.h, run.memory().sigma, run.adaptive)
+                record.mark_failed(failure, core.t, core.h, core.memory().sigma, run.adaptive)
                 break
-            if not one_by_one or run.count == made:
+            if not one_by_one or core.count == made:
                 continue
-            t, state = run.t, run.state
+            t, state = core.t, core.state
             if events is not None:
                 if passing is not None:
-                    passing.follow(run.interval)
+                    passing.follow(core.interval)
                 stop = events.after_step(t_start, start, t, state, run.step_dense(system, start))
                 if stop is not None:
                     record.mark_stopped(stop)
                     break
             t_start, start = t, state
             if tick is not None:
-                driver.call_progress(tick, t, run.h, state)
+                driver.call_progress(tick, t, core.h, state)
         else:
             record.mark_finished(run.t_end)
     except (KeyboardInterrupt, ControllerError, EvaluationError, EventError) as error:
-        record.mark_aborted(run.t, error)
+        record.mark_aborted(core.t, error)
+    attempts: Sequence[tuple[float, float, float, int]] = core.attempts()
     record.attempts = [
-        driver.Attempt(t, h, ratio, DECISIONS[decision]) for t, h, ratio, decision in run.attempts()
+        driver.Attempt(t, h, ratio, DECISIONS[decision]) for t, h, ratio, decision in attempts
     ]
-    record.placed, record.replaced = run.placed, run.replaced
+    record.placed, record.replaced = core.placed, core.replaced
     if passages is not None:
-        passages.examined = [ExaminedPassage(*values) for values in run.examined()]
+        passages.examined = [ExaminedPassage(*values) for values in core.examined()]
     system.count(run.kernel_system.evaluations, run.kernel_system.factorisations)
     record.wall_time = time.perf_counter() - started
     return record
@@ -151,21 +160,22 @@ def why_stopped(
     reason: ReturnReason, system: ClosedSystem | OpenSystem, run: CompiledRun
 ) -> RunFailure:
     """The reason why the kernel stopped, from the reference, which repeats the failed attempt."""
-    attempts: Sequence[tuple[float, float, float, int]] = run.attempts()
+    core = run.core
+    attempts: Sequence[tuple[float, float, float, int]] = core.attempts()
     if reason is ReturnReason.STANDSTILL:
-        return driver.standstill(run.t - run.watched_time)
+        return driver.standstill(core.t - core.watched_time)
     if reason is ReturnReason.CLOSURES:
         failure = driver.Closures(system, run.norm).failure(run.last())
         return failure or RunFailure.of(StopReason.ERROR_ESTIMATE)
-    if reason is ReturnReason.TOO_SHORT and not (attempts and attempts[-1][0] == run.t):
+    if reason is ReturnReason.TOO_SHORT and not (attempts and attempts[-1][0] == core.t):
         return RunFailure.of(StopReason.ROUND_OFF)
-    if run.evaluation_failed:
-        failed = [h for t, h, ratio, _ in attempts if t == run.t and np.isinf(ratio)]
+    if core.evaluation_failed:
+        failed = [h for t, h, ratio, _ in attempts if t == core.t and np.isinf(ratio)]
         # Where a step can just be evaluated, rounding decides: the reference may not fail at the
         # last one.
         for h in reversed(failed):
             try:
-                run.method.step(system, run.t, h, run.state, run.memory(), run.norm)
+                run.method.step(system, core.t, h, core.state, run.memory(), run.norm)
             except EvaluationError as error:
                 return RunFailure(StopReason.NOT_EVALUATED, str(error))
     return RunFailure.of(

@@ -136,7 +136,7 @@ class CompiledObservables(Observables):
 
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         with self._all_rows() as kernel_system:
-            return kernel_system.energies(np.hstack([q, v]))  # type: ignore[no-any-return]
+            return kernel_system.energies(np.concatenate((q, v), axis=1))  # type: ignore[no-any-return]
 
     def reactions(self, t: FloatArray, q: FloatArray, v: FloatArray) -> Reactions:
         """As the reference, by one evaluation of each state; the reference itself where functions
@@ -146,8 +146,12 @@ class CompiledObservables(Observables):
             return super().reactions(t, q, v)
         try:
             with workspace(system) as kernel_system, self._all_rows() as all_rows_system:
+                structure = self.mechanism.structure
                 lam, on_b, joints = kernel_system.reactions(
-                    all_rows_system, self.mechanism.structure.row_scale, *_states(t, q, v)
+                    all_rows_system,
+                    structure.row_scale,
+                    np.flatnonzero(structure.kept).tolist(),
+                    *_states(t, q, v),
                 )
         except ArithmeticError:
             return super().reactions(t, q, v)  # raises the error that says why
@@ -232,4 +236,4 @@ def _separated_rows(
 
 def _states(t: FloatArray, q: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and states (n, nx), as the kernel takes them."""
-    return np.ascontiguousarray(t, dtype=float), np.hstack([q, v])
+    return np.ascontiguousarray(t, dtype=float), np.concatenate((q, v), axis=1)

@@ -114,7 +114,7 @@ class CompiledRun:
     Attributes
     ----------
     core
-        The ``Run`` of the kernel, whose attributes this object has, too.
+        The ``Run`` of the kernel.
 
     Raises
     ------
@@ -281,6 +281,3 @@ class CompiledRun:
                 passage=None,
             )
         )
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.core, name)

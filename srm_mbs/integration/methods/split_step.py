@@ -273,10 +273,9 @@ class SplitStep:
         error = h * (scheme.error @ result.rates)
         weights = norm.weights(np.maximum(memory.state_scale, result.state_scale))
         k = system.multiplier_part.start
-        speeds = system.friction_tolerance(np.zeros(k))[k:]
-        if np.isfinite(speeds).any():
+        if len(sums := system.friction_sums):
             ends = np.array([memory.rate, result.end_rate])
-            unseen = reversal_error(h, ends[:, :k], ends[:, k:], speeds)
+            unseen = reversal_error(h, ends[:, :k], ends[:, k:], sums, system.friction_speed)
             error[k:] = np.maximum(np.abs(error[k:]), unseen)
         if scheme.implicit is not None:
             weights = np.minimum(weights, system.friction_tolerance(result.end_rate[:k]))
@@ -312,9 +311,8 @@ class SplitStep:
         if explicit or scheme.implicit is not None:
             k = system.multiplier_part.start
             v = np.array([memory.rate[:k], result.end_rate[:k]])
-            rubs = np.isfinite(system.friction_tolerance(result.end_rate[:k])[k:])
             weights = norm.weights(memory.state_scale)[k:]
-            if chatters(h, v, result.rates[:, k:], weights, rubs):
+            if chatters(h, v, result.rates[:, k:], weights, system.friction_sums):
                 return np.inf
         return stiffness
 

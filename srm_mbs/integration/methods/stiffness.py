@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from srm_mbs._typing import BoolArray, FloatArray
+from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.integration.methods.base import IntegratorState
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -51,11 +51,11 @@ def stiffness_of(system: System, h: float, difference: FloatArray, change: Float
 
 
 def chatters(
-    h: float, v: FloatArray, accelerations: FloatArray, weights: FloatArray, rubs: BoolArray
+    h: float, v: FloatArray, accelerations: FloatArray, weights: FloatArray, sums: FloatArray
 ) -> bool:
-    """Whether the acceleration of a coordinate with friction varies over a step of ``h`` (s) by
-    more than what would stop it within the step, and by more than the tolerance: stages take its
-    sign at random.
+    """Whether the derivative of a rate with friction varies over a step of ``h`` (s) by more than
+    what would stop it within the step, and by more than the tolerance: stages take its sign at
+    random.
 
     Parameters
     ----------
@@ -63,20 +63,21 @@ def chatters(
         Rates at the ends of the step, and their derivatives at its stages.
     weights : (k,)
         Tolerances of the rates.
-    rubs : (k,)
-        Which coordinates have friction.
+    sums : (n, k)
+        The rates that have friction, as sums of v.
     """
-    if not rubs.any():
+    if not len(sums):
         return False
-    change = h * np.ptp(accelerations, axis=0)
-    return bool((change > np.maximum(np.abs(v).max(axis=0), weights))[rubs].any())
+    change = h * np.ptp(accelerations @ sums.T, axis=0)
+    sizes = np.maximum(np.abs(v @ sums.T).max(axis=0), np.abs(sums) @ weights)
+    return bool((change > sizes).any())
 
 
 def reversal_error(
-    h: float, rates: FloatArray, accelerations: FloatArray, speeds: FloatArray
+    h: float, rates: FloatArray, accelerations: FloatArray, sums: FloatArray, speed: float
 ) -> FloatArray:
-    """Errors (k,) of the rates of coordinates with friction that turn back within a step of ``h``
-    (s) whose stages do not resolve that; 0 for others.
+    """Errors (k,) of the rates of coordinates on which friction acts that changes its sign within a
+    step of ``h`` (s) whose stages do not resolve that; 0 for others.
 
     The acceleration then jumps within the step, and an embedded pair, which takes it for smooth,
     finds the error of that by chance only.
@@ -85,12 +86,15 @@ def reversal_error(
     ----------
     rates, accelerations : (2, k)
         At the ends of the step.
-    speeds : (k,)
-        Rates within which the friction changes its sign; infinite where there is none.
+    sums : (n, k)
+        The rates that have friction, as sums of those.
+    speed
+        Rate within which the friction changes its sign.
     """
-    turned = (rates[0] * rates[1] < 0.0) & (np.abs(rates[1] - rates[0]) > UNRESOLVED * speeds)
+    before, after = sums @ rates[0], sums @ rates[1]
+    turned = (before * after < 0.0) & (np.abs(after - before) > UNRESOLVED * speed)
     jump = np.abs(accelerations[1] - accelerations[0])
-    return np.where(turned, REVERSAL_SHARE * h * jump, 0.0)
+    return np.where((sums[turned] != 0.0).any(axis=0), REVERSAL_SHARE * h * jump, 0.0)
 
 
 def count_stiffness(memory: IntegratorState, stiffness: float, scheme: ButcherTableau) -> None:

@@ -25,6 +25,7 @@ from srm_mbs.visualization.animation.snapshot import draw_snapshot
 from tests.support.browsing import LARGE, opened
 from tests.support.bundled import load
 from tests.support.commands import run as run_command
+from tests.support.mechanisms import DISTINCT_MODELS
 
 VOID = {"meta", "link", "img", "br", "input", "hr"}
 MEGABYTES = 1_000_000
@@ -454,7 +455,7 @@ def test_the_largest_reactions_are_listed_with_their_times(tmp_path: Path) -> No
 
 
 @pytest.mark.stress
-@pytest.mark.parametrize("name", srm.bundled_models())
+@pytest.mark.parametrize("name", DISTINCT_MODELS)
 def test_every_bundled_mechanism_has_a_page_below_five_megabytes(name: str, tmp_path: Path) -> None:
     mechanism = load(name)
     run = srm.simulate(mechanism, min(2.0, mechanism.defaults.t_end or 2.0))

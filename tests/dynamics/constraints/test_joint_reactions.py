@@ -14,7 +14,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from tests.support.bundled import finished, load
-from tests.support.mechanisms import add_link, along_x, floating_ring, rod
+from tests.support.mechanisms import DISTINCT_MODELS, add_link, along_x, floating_ring, rod
 
 assert_close = partial(np.testing.assert_allclose, rtol=0.0)
 
@@ -22,7 +22,7 @@ G = 9.81
 PARTS = ("fx", "fy", "fz", "mx", "my", "mz")
 T_END = 0.3
 """Length (s) of the runs."""
-every_model = pytest.mark.parametrize("name", [*srm.bundled_models(), "n_four_bar_5"])
+every_model = pytest.mark.parametrize("name", [*DISTINCT_MODELS, "n_four_bar_5"])
 
 
 def output_times(name: str) -> np.ndarray:

@@ -37,9 +37,9 @@ from srm_mbs.errors import EvaluationError
 from srm_mbs.formats.load import n_four_bar_texts
 from srm_mbs.integration.kernel import backend
 from tests.support.bundled import load
-from tests.support.mechanisms import floating_ring, floating_slider_crank
+from tests.support.mechanisms import DISTINCT_MODELS, floating_ring, floating_slider_crank
 
-NAMES = srm.bundled_models()
+NAMES = DISTINCT_MODELS
 with_kernel = pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}")
 choices = pytest.mark.parametrize("choice", ["dense", pytest.param("kernel", marks=with_kernel)])
 

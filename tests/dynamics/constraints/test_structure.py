@@ -13,11 +13,12 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints import structure
 from srm_mbs.dynamics.constraints.projection import symmetric
-from srm_mbs.dynamics.constraints.rows import LoopKinematics
+from srm_mbs.dynamics.constraints.rows import Elimination, LoopKinematics
 from srm_mbs.dynamics.constraints.structure import ManifoldSampler, Structure, analyse
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from tests.support.bundled import load
 from tests.support.mechanisms import (
+    DISTINCT_MODELS,
     add_link,
     along_x,
     floating_ring,
@@ -91,7 +92,7 @@ def same(a: Structure, b: Structure) -> bool:
 # --- bundled mechanisms -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", srm.bundled_models())
+@pytest.mark.parametrize("name", DISTINCT_MODELS)
 def test_rank_degrees_of_freedom_and_redundant_rows_are_known(name: str) -> None:
     mechanism = load(name)
     nv, rank, redundant = KNOWN[name]
@@ -481,7 +482,7 @@ def test_rows_are_measured_by_their_distance_from_the_span_of_the_others(name: s
     mechanism = load(name)
     sampler = ManifoldSampler(mechanism, mechanism.structure.units)
     sampler.set_scale(np.random.default_rng(0))
-    q = next(sampler.walk(mechanism.q0, np.random.default_rng(3), 1, 1))
+    (q,) = sampler.walk(mechanism.q0, np.random.default_rng(3), 1, 1)
     found = sampler.distances(q)
     used = np.flatnonzero(np.isfinite(found))
     assert len(used) == mechanism.structure.rank
@@ -494,6 +495,28 @@ def test_rows_are_measured_by_their_distance_from_the_span_of_the_others(name: s
         others = np.delete(W, k, axis=1)
         nearest = others @ np.linalg.lstsq(others, W[:, k], rcond=None)[0]
         assert np.linalg.norm(W[:, k] - nearest) == pytest.approx(distance, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "name", ["slider_crank", "wiper", "delta_robot", "squeezing_mechanism", "n_four_bar_40"]
+)
+def test_the_kernel_walks_as_the_reference_does(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Closures and drives, turns and balls, rows that leave shares of others, sparse algebra."""
+    mechanism = load(name)
+    found = {}
+    for by in ("kernel", "reference"):
+        if by == "reference":
+            monkeypatch.setattr(ManifoldSampler, "_compiled", lambda self: None)
+        sampler = ManifoldSampler(mechanism, mechanism.structure.units)
+        sampler.set_scale(np.random.default_rng(0))
+        sampler.eliminations = (Elimination(0, 2, 0.3),) if len(sampler.scale) > 1 else ()
+        rng = np.random.default_rng(1)
+        rates = np.ones(mechanism.model.nv)
+        samples = sampler.explore(mechanism.q0, rng, 3, 2, rates, sample_start=True)
+        assert len(samples.configurations) > 4
+        found[by] = (sampler.scale, *vars(samples).values())
+    for own, expected in zip(found["kernel"], found["reference"]):
+        assert_close(own, np.array(expected), atol=1e-8)
 
 
 MOTIONS = {"slider_crank": [1, -2], "parallelogram": [1, -1, 1], "n_four_bar_2": [1, -1, 1, -1, 1]}

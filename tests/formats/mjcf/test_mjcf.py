@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
+from srm_mbs._typing import FloatArray
 from srm_mbs.visualization.animation.shapes import visuals_of
 from tests.integration.kernel.test_kernel import agree
 from tests.support.backends import on_both
+from tests.support.dynamics import assert_same_dynamics, closure, states
 from tests.support.lockstep import compare
 from tests.support.mjcf_files import (
     BODY,
@@ -85,7 +88,47 @@ CABLES = """<mujoco><worldbody>
       <joint joint="a" coef="-0.1"/></fixed>
     <fixed damping="3"><joint joint="e" coef="0.5"/><joint joint="b" coef="0.25"/></fixed></tendon>
   </mujoco>"""
+SLACK = """<mujoco><worldbody><site name="hook" pos="0.1 0.2 0.9"/>
+  <body name="hub"><joint name="a" axis="0 1 0" ref="20"/>
+    <geom type="capsule" size="0.1 0.2" pos="0.3 0 0.1"/>
+    <body name="arm" pos="0.5 0 0"><site name="tip" pos="0.3 0 0"/>
+      <joint name="b" axis="0 0 1" springref="-30"/>
+      <joint name="c" type="slide" axis="1 0 0" springref="0.1" ref="0.3"/>
+      <geom type="capsule" size="0.1 0.2" pos="0.3 0.1 0"/></body></body></worldbody>
+  <tendon><fixed name="cable" {}><joint joint="a" coef="0.4"/>
+      <joint joint="c" coef="2"/><joint joint="b" coef="-0.7"/></fixed>
+    <fixed name="own" stiffness="7" springlength="-1 0.2"><joint joint="b" coef="0.5"/></fixed>
+    <spatial name="rope" stiffness="50" damping="3" springlength="0 0.7"><site site="hook"/>
+      <site site="tip"/></spatial></tendon></mujoco>"""
+GLOBAL = """<mujoco><compiler angle="radian" coordinate="global"/><worldbody>
+  <body name="post" pos="1 2 0" axisangle="0 0 1 1.5707963267948966">
+    <joint name="a" axis="0 1 0" pos="1 2.5 0.5" ref="0.2" armature="0.1"/>
+    <geom type="capsule" size="0.1" fromto="1 2 0 1 3 0.5"/>
+    <body name="bare"><joint name="b" type="slide" axis="0 0 1" pos="5 5 5"/>
+      <geom type="box" size="0.1 0.2 0.3" pos="1 3 1" axisangle="0 0 1 1.5707963267948966"/>
+      <body name="tip"><joint name="c" axis="1 0 0" pos="1 3 1.5"/>
+        <inertial pos="1 3.25 1.5" mass="2" diaginertia="0.1 0.2 0.25"/>
+        <site name="end" pos="1 3.5 1.5"/></body></body></body>
+  <body name="strut" pos="1 4 0"><joint name="d" type="ball" pos="1 4 0"/>
+    <geom type="capsule" size="0.1" fromto="1 4 0 1 3.5 1.5"/></body></worldbody>
+  <equality><connect name="pin" body1="strut" body2="tip" anchor="1 3.5 1.5"/></equality>
+  </mujoco>"""
+LOCAL = """<mujoco><compiler angle="radian"/><worldbody>
+  <body name="post" pos="1 2 0" axisangle="0 0 1 1.5707963267948966">
+    <joint name="a" axis="1 0 0" pos="0.5 0 0.5" ref="0.2" armature="0.1"/>
+    <geom type="capsule" size="0.1" fromto="0 0 0 1 0 0.5"/>
+    <body name="bare" pos="1 0 1"><joint name="b" type="slide" axis="0 0 1"/>
+      <geom type="box" size="0.1 0.2 0.3"/>
+      <body name="tip" pos="0.25 0 0.5"><joint name="c" axis="0 -1 0" pos="-0.25 0 0"/>
+        <inertial pos="0 0 0" mass="2" diaginertia="0.2 0.1 0.25"/>
+        <site name="end" pos="0.25 0 0"/></body></body></body>
+  <body name="strut" pos="1 4 0"><joint name="d" type="ball"/>
+    <geom type="capsule" size="0.1" fromto="0 0 0 0 -0.5 1.5"/></body></worldbody>
+  <equality><connect name="pin" body1="strut" body2="tip" anchor="0 -0.5 1.5"/></equality>
+  </mujoco>"""
 FILES = {
+    "slack": SLACK.format('stiffness="40" damping="2" springlength="0.6 0.9"'),
+    "local": LOCAL,
     "tree": TREE,
     "cables": CABLES,
     "three": THREE,
@@ -109,7 +152,7 @@ def test_mass_matrix_and_forces_are_those_of_mujoco(name: str) -> None:
     check_dynamics(Twins(FILES[name]))
 
 
-@pytest.mark.parametrize("name", ["four_bar", "tendons", "three", "curved", "two_loops"])
+@pytest.mark.parametrize("name", ["four_bar", "tendons", "three", "curved", "two_loops", "local"])
 def test_residuals_of_equality_constraints_are_those_of_mujoco(name: str) -> None:
     check_residuals(Twins(FILES[name]))
 
@@ -352,3 +395,60 @@ def test_a_knee_that_slides_moves_as_the_constrained_equations_have_it(
         kkt = np.block([[M, J.T], [J, np.zeros((1, 1))]])
         expected = np.linalg.solve(kkt, np.append(-state.qfrc_bias, -rate))[:3]
         np.testing.assert_allclose(acceleration, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_global_coordinates_mean_the_same_model_as_local_ones(tmp_path: Path) -> None:
+    """MuJoCo itself reads local ones only; the other tests compare those with it."""
+    loaded = []
+    for name, text in (("global", GLOBAL), ("local", LOCAL)):
+        path = tmp_path / f"{name}.xml"
+        path.write_text(text)
+        loaded.append(srm.load(path))
+    ours, local = loaded
+    assert_same_dynamics(ours.model, local.model, atol=1e-10)
+    for q, v in states(ours.model):
+        # g, its rate and acceleration, whose components are in frames of their own.
+        sizes = [np.linalg.norm(closure(each, q, v).reshape(3, 3), axis=1) for each in loaded]
+        np.testing.assert_allclose(*sizes, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("tendon", "friction"),
+    [
+        ('armature="3" damping="2" stiffness="40" springlength="0.7"', 0.0),
+        ('frictionloss="6" stiffness="40" springlength="0.6 0.9"', 6.0),
+    ],
+)
+def test_armature_friction_and_slack_of_a_fixed_tendon_act(
+    tendon: str, friction: float, tmp_path: Path
+) -> None:
+    """The motion is that of MuJoCo's accelerations without its constraints, to which friction is
+    added as this package smooths it."""
+    path = tmp_path / "slack.xml"
+    path.write_text(SLACK.format(tendon))
+    mechanism = srm.load(path)
+    assert mechanism.degrees_of_freedom == 3
+    rates = {"a": 1.0, "b": -2.0, "c": 1.5}
+    start = srm.assemble(mechanism, {"a": 0.0, "b": 0.0, "c": 0.0}, rates)
+    run = srm.simulate(mechanism, 0.5, q0=start.q, v0=start.v, rtol=1e-9)
+    assert run.success, run.message
+
+    theirs = mujoco.MjModel.from_xml_path(str(path))
+    theirs.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    state = mujoco.MjData(theirs)
+    factors, speed = np.array([0.4, -0.7, 2.0]), mechanism.friction_speed
+
+    def field(t: float, y: FloatArray) -> FloatArray:
+        state.qpos[:], state.qvel[:] = theirs.qpos0 + y[:3], y[3:]
+        mujoco.mj_forward(theirs, state)
+        M = np.zeros((3, 3))
+        mujoco.mj_fullM(theirs, state, M)
+        held = -friction * np.tanh(factors @ y[3:] / speed) * factors
+        return np.concatenate([y[3:], np.linalg.solve(M, state.qfrc_smooth + held)])
+
+    start_y = np.concatenate([np.zeros(3), list(rates.values())])
+    expected = solve_ivp(field, (0.0, 0.5), start_y, method="LSODA", rtol=1e-10, atol=1e-12)
+    found = np.array([float(run.joint(name)[0][-1]) for name in rates])
+    assert np.abs(expected.y[:3, -1]).max() > 0.2
+    np.testing.assert_allclose(found, expected.y[:3, -1], atol=1e-7)
+    assert run.energy_balance.relative < 1e-6

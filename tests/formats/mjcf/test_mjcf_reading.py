@@ -140,7 +140,8 @@ FAULTS = {
     "composite": (JOINT, JOINT + "<composite/>"),
     "flexcomp": (JOINT, JOINT + "<flexcomp/>"),
     "attach": (JOINT, JOINT + '<attach model="arm"/>'),
-    "global": ("<worldbody>", '<compiler coordinate="global"/><worldbody>'),
+    "global": ("<worldbody>", '<compiler coordinate="global"/><worldbody><frame/>'),
+    "height field": ('type="sphere" size="0.1"', 'type="hfield" hfield="h"'),
     "order": ("<worldbody>", '<compiler eulerseq="xyw"/><worldbody>'),
     "angle": ("<worldbody>", '<compiler angle="grad"/><worldbody>'),
     "medium": ("<worldbody>", '<option density="1000"/><worldbody>'),
@@ -167,10 +168,12 @@ EQUALITIES = {
 
 
 TENDON = '<tendon><fixed {}><joint joint="{}" coef="{}"/></fixed></tendon>'
+LINE = '<tendon><spatial {}><site site="s"/><site site="s"/></spatial></tendon>'
 TENDONS = {
-    "with dead zone": TENDON.format('stiffness="2" springlength="0 1"', "j", 1),
-    "with friction": TENDON.format('frictionloss="2"', "j", 1),
-    "with armature": TENDON.format('armature="2"', "j", 1),
+    "of decreasing length": TENDON.format('stiffness="2" springlength="1 0"', "j", 1),
+    "along a line with friction": LINE.format('frictionloss="2"'),
+    "along a line with armature": LINE.format('armature="2"'),
+    "with friction on no such joint": TENDON.format('frictionloss="2"', "x", 1),
     "on no such joint": TENDON.format('stiffness="2"', "x", 1),
     "on no joint": TENDON.format('stiffness="2"', "j", 0),
 }

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from itertools import combinations
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.dynamics.multibody import make_system
 from tests.support.bundled import finished, load
 from tests.support.one_degree import (
     OneDegree,
@@ -26,10 +25,6 @@ from tests.support.one_degree import (
     polar,
 )
 from tests.support.reduced import trajectory
-from tools.models.planar import JANSEN
-from tools.models.planar import meeting as real_meeting
-
-DATA = Path(__file__).parents[2] / "data" / "planar"
 
 
 def distance(a: Point, b: Point) -> float:
@@ -206,103 +201,39 @@ def test_the_ram_of_the_quick_return_is_faster_on_its_way_back() -> None:
 
 # -- the same mechanisms made otherwise -------------------------------------------------------
 
-
-@pytest.mark.parametrize(
-    ("name", "t_end", "joints"),
-    [
-        ("four_bar", 2.0, {"O": "crank", "A": "coupler"}),
-        ("slider_crank", 2.0, {"O": "crank"}),
-    ],
-)
-def test_a_linkage_typed_in_moves_as_the_bundled_one(
-    name: str, t_end: float, joints: dict[str, str]
-) -> None:
-    ours = finished(srm.load(DATA / f"{name}.toml"), t_end, rtol=1e-10)
-    other = finished(load(name), t_end, rtol=1e-10)
-    times = np.linspace(0.0, t_end, 9)
-    for mine, theirs in joints.items():
-        for one, two in zip(ours.at(times).joint(mine), other.at(times).joint(theirs)):
-            turns = 2.0 * np.pi * np.round((one - two)[0] / (2.0 * np.pi))
-            np.testing.assert_allclose(one - turns, two, atol=1e-7)
+# Joint that is the crank, and end of the run (s), of those that are also bundled as URDF.
+TWINS = {
+    "slider_crank": ("O", 2.0),
+    "four_bar": ("O", 2.0),
+    "watt_six_bar": ("A", 1.0),
+    "jansen_walker": ("O", 0.6),
+}
 
 
-def of_links(mechanism: srm.Mechanism, names: Mapping[str, str]) -> dict[str, dict[str, float]]:
-    """Masses and moments of inertia of joints of another mechanism, for bars by their names."""
-    found: dict[str, dict[str, float]] = {"masses": {}, "inertias": {}}
-    for bar, joint in names.items():
-        inertia = mechanism.model.inertias[mechanism.model.getJointId(joint)]
-        found["masses"][bar] = inertia.mass
-        found["inertias"][bar] = inertia.inertia[1, 1]
-    return found
+def acceleration(mechanism: srm.Mechanism, joint: str, state: np.ndarray) -> float:
+    rate = make_system(mechanism).evaluate(0.0, state).rate()
+    return float(rate[mechanism.model.nv + mechanism.joint(joint).idx_v])
 
 
-def as_bundled(name: str, t_end: float, crank: str, **linkage: Any) -> None:
-    """Compare the angle of the crank, which in the other mechanism counts from the start."""
-    bars = dict.fromkeys(linkage["bars"])
-    other = load(name)
-    ours = srm.planar(**linkage, **of_links(other, {bar: bar for bar in bars}))
+@pytest.mark.parametrize("name", TWINS)
+def test_a_linkage_typed_in_is_the_bundled_urdf_to_rounding(name: str) -> None:
+    """Accelerations at equal states of the crank along the motion, and the motion itself."""
+    crank, t_end = TWINS[name]
+    ours, other = load(f"{name}_planar"), load(name)
+    assert ours.source is not None
+    assert ours.source.format == "planar linkage"
     assert ours.degrees_of_freedom == other.degrees_of_freedom
     assert len(ours.loops) == len(other.loops)
-    times = np.linspace(0.0, t_end, 9)
-    one = finished(ours, t_end, rtol=1e-10).at(times).joint(crank)
-    two = finished(other, t_end, rtol=1e-10).at(times).joint("crank")
-    np.testing.assert_allclose(one[0] - one[0][0], two[0], atol=2e-7)
-    np.testing.assert_allclose(one[1], two[1], atol=2e-6)
-
-
-def test_watts_six_bar_typed_in_moves_as_the_bundled_one() -> None:
-    a, d = point(0.0, 0.0), point(1.0, 0.0)
-    b = 0.3 * point(np.cos(1.0), np.sin(1.0))
-    c = real_meeting(b, 0.9, d, 0.7, left=True)
-    e, f = real_meeting(b, 0.75, c, 0.6, left=True), real_meeting(d, 1.2, c, 0.6, left=False)
-    g = real_meeting(e, 0.9, f, 0.8, left=True)
-    as_bundled(
-        "watt_six_bar",
-        1.0,
-        "A",
-        points={"A": a, "B": b, "C": c, "D": d, "E": e, "F": f, "G": g},
-        bars={
-            "crank": list("AB"),
-            "coupler": list("BCE"),
-            "left": list("EG"),
-            "rocker": list("DCF"),
-            "right": list("FG"),
-        },
-        ground=("A", "D"),
-        rates={"A": 8.0},
-    )
-
-
-def test_jansens_walker_typed_in_moves_as_the_bundled_one() -> None:
-    n = JANSEN
-    points: dict[str, Any] = {"O": (0.0, 0.0), "hip_l": (-0.38, -0.078), "hip_r": (0.38, -0.078)}
-    bars: dict[str, tuple[str, ...]] = {"crank": ("O", "pin_0", "pin_1")}
-    for k, angle in enumerate((0.5, 0.5 + np.pi)):
-        pin_ = points[f"pin_{k}"] = n["m"] * point(np.cos(angle), np.sin(angle))
-        for side, mirrored in (("left", False), ("right", True)):
-            leg, hip_name = f"{side}_{k}", f"hip_{side[0]}"
-            hip = np.array(points[hip_name])
-            above = real_meeting(pin_, n["j"], hip, n["b"], left=mirrored)
-            below = real_meeting(pin_, n["k"], hip, n["c"], left=not mirrored)
-            back = real_meeting(hip, n["d"], above, n["e"], left=not mirrored)
-            ankle = real_meeting(back, n["f"], below, n["g"], left=mirrored)
-            foot = real_meeting(ankle, n["h"], below, n["i"], left=mirrored)
-            found = {"above": above, "below": below, "back": back, "ankle": ankle, "foot": foot}
-            points |= {f"{leg}_{name}": at for name, at in found.items()}
-            for bar, ends in {
-                "j": (f"pin_{k}", "above"), "k": (f"pin_{k}", "below"),
-                "hip": (hip_name, "above", "back"), "f": ("back", "ankle"),
-                "c": (hip_name, "below"), "foot": ("below", "ankle", "foot"),
-            }.items():  # fmt: skip
-                bars[f"{leg}_{bar}"] = tuple(
-                    end if end in points else f"{leg}_{end}" for end in ends
-                )
-    as_bundled(
-        "jansen_walker",
-        0.6,
-        "O",
-        points=points,
-        bars=bars,
-        ground=("O", "hip_l", "hip_r"),
-        rates={"O": 6.0},
-    )
+    mine, theirs = (finished(each, t_end, rtol=1e-10) for each in (ours, other))
+    places = ours.joint(crank).idx_q, other.joint("crank").idx_q
+    # The angles of the other may count from the start.
+    before = ours.q0[places[0]] - other.q0[places[1]]
+    for t in np.linspace(0.0, t_end, 5):
+        (q, v), (angles, rates) = mine(t), theirs(t)
+        angle, rate = before + angles[places[1]], rates[other.joint("crank").idx_v]
+        assert q[places[0]] == pytest.approx(angle, abs=2e-7)
+        near = ours.with_state(q, v)
+        state = srm.assemble(near, q={crank: angle}, v={crank: rate})
+        expected = acceleration(other, "crank", np.concatenate([angles, rates]))
+        found = acceleration(ours, crank, np.concatenate([state.q, state.v]))
+        assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)

@@ -127,7 +127,16 @@ def _states(mechanism: srm.Mechanism) -> list[tuple[FloatArray, FloatArray]]:
     ]
 
 
-@pytest.mark.parametrize("name", MECHANISMS)
+LARGE = {"a walker with damping", "a walker with damping in all joints", "a chain on a plane"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.stress] if name in LARGE else [])
+        for name in MECHANISMS
+    ],
+)
 def test_the_linearised_equations_are_those_of_differences(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

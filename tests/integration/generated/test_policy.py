@@ -57,6 +57,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
     """Makes the C compiler of a script; it appends a line to the file that is returned."""
     path, log = tmp_path / "compiler", tmp_path / "calls"
+    code_cache.compiler()  # kept by the process, which goes on with other tests
     monkeypatch.setenv("CC", str(path))
     monkeypatch.setattr(code_cache, "compiler", code_cache.compiler.__wrapped__)
     log.write_text("")

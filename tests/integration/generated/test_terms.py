@@ -20,7 +20,7 @@ from srm_mbs.integration.kernel.system import make_kernel_system
 from tests.support.bundled import load
 from tests.support.dynamics import mass_matrix, nonlinear_effects
 from tests.support.generated import GeneratedFunction
-from tests.support.mechanisms import along_x, rod
+from tests.support.mechanisms import DISTINCT_MODELS, along_x, rod
 
 pytestmark = [
     pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}"),
@@ -147,7 +147,7 @@ def _ring(kind: str, ground: bool) -> srm.Mechanism:
     return srm.Mechanism(model, [loop], q0=pin.neutral(model))
 
 
-@pytest.mark.parametrize("ground", [True, False])
+@pytest.mark.parametrize("ground", [pytest.param(True, marks=pytest.mark.stress), False])
 @pytest.mark.parametrize("kind", CLOSURES)
 def test_rows_of_closures_are_those_of_the_reference(kind: str, ground: bool) -> None:
     mechanism = _ring(kind, ground)
@@ -176,15 +176,25 @@ def _agree(mechanism: srm.Mechanism, count: int = 8) -> None:
                 assert np.abs(a[key] - b[key]).max() <= max(allowed, 1e-12) * max(size, 1e-3), key
 
 
-@pytest.mark.parametrize("loops", [19, 30])
+@pytest.mark.parametrize("loops", [19, pytest.param(32, marks=pytest.mark.stress)])
 def test_evaluations_of_many_loops_are_those_of_the_kernel(loops: int) -> None:
     """With generated algebra, and beyond its sizes with the kernel's."""
     mechanism = srm.n_four_bar(loops)
-    assert (algebra_of(mechanism.model.nv, 2 * loops, 2 * loops) != "") == (loops == 19)
+    algebra = algebra_of(mechanism.model.nv, 2 * loops, 2 * loops, (), ())
+    assert (algebra != "") == (loops == 19)
     _agree(mechanism, count=2)
 
 
-@pytest.mark.parametrize("name", srm.bundled_models())
+LARGE = {"delta_robot", "stewart_platform"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.stress] if name in LARGE else [])
+        for name in DISTINCT_MODELS
+    ],
+)
 def test_evaluations_of_bundled_mechanisms_are_those_of_the_kernel(name: str) -> None:
     _agree(load(name))
 

@@ -173,6 +173,9 @@ def test_force_elements_friction_damping_and_a_controller_act_alike() -> None:
         srm.SpringDamper(a, b, stiffness=20.0, damping=0.3, rest_length=0.4, name="spring"),
         srm.TorsionSpring(joint, stiffness=2.0, damping=0.1, rest_angle=0.3, name="torsion"),
         srm.CouplingSpring(mechanism.joint_names[:2], (0.5, -1.5), 1.0, 0.2, 0.1, name="cable"),
+        srm.CouplingSpring(
+            mechanism.joint_names[:2], (0.3, 1.0), 1.0, 0.0, 0.1, "belt", slack=0.2, friction=0.02
+        ),
         srm.JointTorque(joint, 0.2, name="motor"),
         srm.Wrench(a, force=(1.0, 0.0, 2.0), moment=(0.0, 0.3, 0.0), frame="link", name="jet"),
         srm.Wrench(a, force=(0.0, 0.0, 0.5), moment=(0.1, 0.0, 0.0), frame="world", name="wind"),
@@ -350,5 +353,5 @@ def test_the_first_step_agrees(name: str) -> None:
             max_step=np.inf,
             placed="automatic",
         )
-        found = run.snapshot().control.h
+        found = run.core.snapshot().control.h
         assert found == pytest.approx(expected, rel=1e-9 / min(1.0, memory.sigma) ** 2)

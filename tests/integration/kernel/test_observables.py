@@ -19,7 +19,7 @@ from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.kernel import backend as kernel
 from srm_mbs.integration.kernel.observables import CompiledObservables
 from tests.support.bundled import load
-from tests.support.mechanisms import floating_ring, random_state
+from tests.support.mechanisms import DISTINCT_MODELS, floating_ring, random_state
 
 pytestmark = pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
 
@@ -31,6 +31,7 @@ ELEMENTS: dict[str, tuple[srm.ForceElement, ...]] = {
         srm.SpringDamper(LINK, GROUND, 30.0, 2.0, 0.2, "strut"),
         srm.SpringDamper(LINK, GROUND, 30.0, 0.0, 0.2, "without damping"),
         srm.SpringDamper(LINK, GROUND, 0.0, 3.0, 0.0, "damper"),
+        srm.SpringDamper(LINK, GROUND, 30.0, 1.0, 0.0, "rope", slack=0.3),
     ),
     "a bushing": (
         srm.Bushing(LINK, GROUND, (5.0, 6.0, 7.0, 1.0, 2.0, 3.0), (0.5,) * 6, "bushing"),
@@ -39,6 +40,9 @@ ELEMENTS: dict[str, tuple[srm.ForceElement, ...]] = {
         srm.TorsionSpring("crank", 4.0, 0.7, 0.3, name="torsion"),
         srm.LimitSpring("crank", 100.0, 3.0, lower=-0.4, upper=0.5, depth=0.3, name="limit"),
         srm.CouplingSpring(("crank", "coupler"), (1.0, -2.0), 6.0, 0.4, 0.1, name="coupling"),
+        srm.CouplingSpring(
+            ("crank", "coupler"), (0.5, 1.0), 6.0, 0.0, 0.1, "belt", slack=0.3, friction=0.2
+        ),
     ),
     "loads": (
         srm.JointTorque("crank", 2.0, name="torque"),
@@ -181,7 +185,7 @@ def agrees_with_lapack(mechanism: srm.Mechanism, t: FloatArray, q: FloatArray) -
     return found
 
 
-@pytest.mark.parametrize("name", srm.bundled_models())
+@pytest.mark.parametrize("name", DISTINCT_MODELS)
 def test_smallest_singular_values_are_those_of_the_plain_computation(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -296,7 +300,7 @@ def assert_same_reactions(mechanism: srm.Mechanism, tolerance: float = 1e-9) -> 
     np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-10 * np.abs(b).max())
 
 
-@pytest.mark.parametrize("name", [*srm.bundled_models(), "n_four_bar_12"])
+@pytest.mark.parametrize("name", [*DISTINCT_MODELS, "n_four_bar_12"])
 def test_reactions_are_those_of_the_reference(name: str) -> None:
     assert_same_reactions(load(name))
 

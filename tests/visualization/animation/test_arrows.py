@@ -66,7 +66,7 @@ def page(
     browser: Any, driven: srm.Solution, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Any]:
     folder = tmp_path_factory.mktemp("page")
-    with exported(browser, folder, driven, (660, 400), fps=64.0, arrows=True) as shown:
+    with exported(browser, folder, driven, (660, 440), fps=64.0, arrows=True) as shown:
         yield shown
 
 
@@ -245,3 +245,24 @@ def test_a_picture_has_the_arrows_of_its_time_and_their_legend(
             page.evaluate(DRAWN, t)
             assert np.abs(pixels(page.screenshot()) - picture).max() < 0.05
     assert np.abs(pictures[0] - pictures[1]).max() > 0.5
+
+
+@pytest.mark.browser
+def test_on_a_phone_the_legend_covers_the_motion_only_when_it_is_asked_for(page: Any) -> None:
+    before = page.viewport_size
+    legend, button = page.locator("#notes"), page.get_by_role("button", name="Legend")
+    assert legend.is_visible()
+    assert not button.is_visible()
+    page.set_viewport_size({"width": 360, "height": 560})
+    button.wait_for()
+    assert not legend.is_visible()
+    assert button.get_attribute("aria-expanded") == "false"
+    covered = page.locator("#panel").bounding_box()["height"]
+    button.click()
+    assert legend.is_visible()
+    assert "reactions" in legend.inner_text()
+    assert page.locator("#panel").bounding_box()["height"] > covered
+    button.click()
+    assert not legend.is_visible()
+    page.set_viewport_size(before)
+    legend.wait_for()

@@ -184,6 +184,7 @@ def test_a_click_shows_positions_in_degrees_and_the_ratio_of_the_rates(
     page.keyboard.press("Escape")
 
 
+@pytest.mark.stress
 @pytest.mark.browser
 def test_a_finger_turns_a_rocker_over_its_dead_points_on_a_phone(
     browser: Any, tmp_path: Path

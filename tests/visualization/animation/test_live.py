@@ -46,6 +46,7 @@ def test_the_page_follows_the_run_and_then_plays_it(browser: Any) -> None:
         assert page.evaluate("animator.duration") == pytest.approx(1.5, rel=1e-6)
         page.wait_for_function("!element('bar').hidden")
         # What there is to say about the whole run has come with it.
+        page.get_by_role("button", name="Legend").click()  # the window is small
         words = page.locator("#panel").inner_text()
         assert "sigma" in words
         assert "force in the closures" in words

@@ -143,6 +143,7 @@ def test_the_motion_is_played_at_the_chosen_speed_after_scrubbing(page: Any, spe
     assert_pace(page, 0.8)
 
 
+@pytest.mark.stress
 @pytest.mark.browser
 def test_a_page_that_cannot_keep_up_leaves_pictures_out_and_keeps_the_time(page: Any) -> None:
     page.evaluate("""() => {

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.formats.load import bundled_models
 from srm_mbs.visualization.animation.meshcat_scene import node_names
 from srm_mbs.visualization.animation.shapes import Mesh, visuals_of
 from srm_mbs.visualization.animation.trajectory import MAX_BODY_FRAMES
 from tests.support.browsing import DRAWN, assert_in_place, opened
 from tests.support.bundled import load, problem
+from tests.support.mechanisms import DISTINCT_MODELS
 
 FPS = 32.0
 SPANS = {"squeezing_mechanism": 0.03125, "cassie": 0.375}
@@ -62,7 +62,7 @@ CHOSEN = {"slider_crank"}
         "cassie",
         *(
             pytest.param(name, marks=[] if name in CHOSEN else pytest.mark.stress)
-            for name in bundled_models()
+            for name in DISTINCT_MODELS
         ),
     ],
 )

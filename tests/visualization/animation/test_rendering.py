@@ -209,6 +209,7 @@ def test_the_frames_of_a_film_from_the_command_line_show_the_bob_where_it_is(
         np.testing.assert_allclose(orange_at(frames[round(t * 25.0)]), expected, atol=3.0)
 
 
+@pytest.mark.stress
 @pytest.mark.browser
 def test_the_command_line_writes_pictures_of_a_run_and_of_a_saved_one(tmp_path: Path) -> None:
     saved, first, second = (str(tmp_path / name) for name in ("run.npz", "a.png", "b.png"))
@@ -221,6 +222,7 @@ def test_the_command_line_writes_pictures_of_a_run_and_of_a_saved_one(tmp_path: 
     np.testing.assert_allclose(orange_at(a), orange_at(b), atol=0.5)
 
 
+@pytest.mark.stress
 @pytest.mark.browser
 def test_the_command_line_gives_an_image_its_size_for_print(tmp_path: Path) -> None:
     from PIL import Image

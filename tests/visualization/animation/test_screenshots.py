@@ -25,7 +25,7 @@ def seen(shot: Shot, browser: Any) -> Any:
     return pixels(taken(shot, browser))
 
 
-SLOW = {"slider_crank_behind", "spatial_four_bar_bars"}
+SLOW = {"slider_crank_behind", "spatial_four_bar_bars", "stewart_platform"}
 
 
 @pytest.mark.browser
@@ -89,7 +89,8 @@ def test_a_body_beside_its_place_by_two_percent_of_the_picture_is_seen(
     ("shot", "name"),
     [
         pytest.param("slider_crank_start", "crank", marks=pytest.mark.stress),
-        ("delta_robot_reactions", "sway_1b"),  # the thinnest of all
+        # The thinnest of all.
+        pytest.param("delta_robot_reactions", "sway_1b", marks=pytest.mark.stress),
     ],
 )
 def test_a_body_that_is_not_there_is_seen(

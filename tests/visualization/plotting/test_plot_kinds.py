@@ -25,7 +25,7 @@ from srm_mbs.visualization.plotting.poses import plane_normal
 from tests.support.bundled import load
 from tests.support.commands import error_line, run
 from tests.support.daes import START_TWO, problem_two, solution_two
-from tests.support.mechanisms import add_link, floating_ring
+from tests.support.mechanisms import DISTINCT_MODELS, add_link, floating_ring
 from tests.support.snapshots import check_messages, refused
 from tests.visualization.plotting.test_plots import fails_at, legend, line, marked_times, titles
 
@@ -83,7 +83,17 @@ def note(figure: Figure) -> str:
 # -- all kinds --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", srm.bundled_models())
+DRAWN = {"slider_crank", "delta_robot", "differential", "klann_walker"}
+"""Of one loop in a plane, of drives, of joint closures, of many loops and points."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in DRAWN else [pytest.mark.stress])
+        for name in DISTINCT_MODELS
+    ],
+)
 def test_every_kind_of_every_bundled_mechanism_is_drawn_without_warnings(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

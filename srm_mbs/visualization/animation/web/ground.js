@@ -74,6 +74,9 @@ function pixel_size() {
   return high && 2 * distance * Math.tan(camera.fov * Math.PI / 360) / camera.zoom / high;
 }
 
+// Longest bar of the scale (pixels): one of two fifths of it is still wider than its text.
+const SCALE = 150;
+
 // Axes and scale change with the camera only.
 let last_view = "";
 at_frame.push(() => {
@@ -85,7 +88,7 @@ at_frame.push(() => {
   const view = `${matrix.map((x) => x.toPrecision(6))} ${high}`;
   if (view === last_view || !high) return;
   last_view = view;
-  const pixel = pixel_size(), length = round_length(110 * pixel);
+  const pixel = pixel_size(), length = round_length(SCALE * pixel);
   element("length").style.width = `${length / pixel}px`;
   const units = [[1, "m"], [1e-3, "mm"], [1e-6, "\u00b5m"]];
   const [size, unit] = units.find(([size]) => length >= 0.999 * size) ?? units[2];

@@ -34,7 +34,7 @@ const pane = element("meshcat-pane");
 pane.setAttribute("aria-label", document.title);
 const set_size = viewer.set_3d_pane_size;  // of itself it takes the height of the window
 viewer.set_3d_pane_size = () => set_size.call(viewer, pane.clientWidth, pane.clientHeight);
-new ResizeObserver(() => viewer.set_3d_pane_size()).observe(pane);
+new ResizeObserver(() => { viewer.set_3d_pane_size(); fold_notes(); }).observe(pane);
 let away = 1;
 function step_back() {
   const wanted = Math.max(1, about.aspect * pane.clientHeight / pane.clientWidth);
@@ -87,7 +87,25 @@ function fill_panel() {
     for (const end of note.ends) add(ends, "span", { textContent: end });
   }
   element("panel").hidden = !about.panel && !about.notes.length;
+  fold_notes();
 }
+
+// In a small window the notes would lie on the motion: there a button unfolds them.
+const SMALL = [640, 420], MOST_COVERED = 0.25;  // pixels; part of the height of the picture
+let unfolded = false;
+function fold_notes() {
+  const notes = element("notes"), button = element("unfold");
+  notes.hidden = false;
+  button.hidden = true;
+  if (!about.panel) return;  // pictures
+  const small = window.innerWidth <= SMALL[0] || window.innerHeight <= SMALL[1];
+  const height = element("panel").offsetHeight, most = MOST_COVERED * pane.clientHeight;
+  if (!small || !notes.childElementCount || height <= most) return;
+  button.hidden = false;
+  notes.hidden = !unfolded;
+  button.setAttribute("aria-expanded", unfolded);
+}
+element("unfold").onclick = () => { unfolded = !unfolded; fold_notes(); };
 
 const times_of = (value) => value.times ?? (value.body ? about.joint_times : about.times);
 

@@ -451,11 +451,13 @@ def _dips(sigma: FloatArray, lowest: FloatArray) -> list[tuple[int, int, int]]:
     return list(zip(first[chosen].tolist(), k[chosen].tolist(), last[chosen].tolist()))
 
 
-def _times_around(t: FloatArray, first: int, k: int, last: int, width: int) -> FloatArray:
-    """Sampling times around the sample ``k`` of a window: ``width`` intervals on either side, and
-    the samples ``first`` and ``last``."""
+def _times_around(
+    t: FloatArray, first: int, k: int, last: int, width: int, count: int
+) -> FloatArray:
+    """Sampling times around the sample ``k`` of a window: ``width`` intervals on either side with
+    ``count`` samples each, and the samples ``first`` and ``last``."""
     nodes = t[max(first, k - width) : min(last, k + width) + 1]
-    fractions = np.arange(SAMPLES_PER_INTERVAL) / SAMPLES_PER_INTERVAL
+    fractions = np.arange(count) / count
     inner = (nodes[:-1, None] + np.diff(nodes)[:, None] * fractions).ravel()
     outer = [t[[first]], inner, nodes[-1:], t[[last]]]
     return np.unique(np.concatenate(outer))
@@ -605,7 +607,7 @@ def find_crossings(
     tops = [t[begin + int(np.argmax(sigma[begin : end + 1]))] for begin, end, _ in windows]
     scales = monitor.smallest(np.array(tops)).tolist() if windows else []
     examined = [
-        (_times_around(t[begin : end + 1], *dip, DIP_WIDTHS[0]), t[begin : end + 1], dip, scale)
+        (_times_around(t[begin : end + 1], *dip, DIP_WIDTHS[0], 1), t[begin : end + 1], dip, scale)
         for (begin, end, dips), scale in zip(windows, scales)
         for dip in dips
     ]
@@ -631,43 +633,73 @@ def _crossings_at(
 ) -> list[Crossing]:
     """The crossings at a minimum of sigma in a window with the samples t (k,).
 
-    ``scale``: the largest singular value there; ``values`` (n,): those at the first ``times`` (n,)
-    around the minimum.
+    ``scale``: the largest singular value there; ``values`` (n,): those at ``times`` (n,), the
+    recorded ones around the minimum.
     """
     minima = _minima(values, max(scale, float(values.max())))
-    for width in DIP_WIDTHS[1:]:
-        if minima:
-            break
-        times = _times_around(t, *dip, width)
+    if len(minima) == 1:
+        near = slice(minima[0][1] - 1, minima[0][1] + 2)
+        lowest = monitor.minimum(times[near], values[near])
+        if _vanishes_once(times[near], values[near], lowest, scale):
+            crossing = _crossing_at(monitor, steps, minima[0], scale, times, values, lowest)
+            return [] if crossing is None else [crossing]
+    # The widest has the samples of the others.
+    for width in DIP_WIDTHS if minima else DIP_WIDTHS[-1:]:
+        times = _times_around(t, *dip, width, SAMPLES_PER_INTERVAL)
         values = monitor.smallest(times)
         minima = _minima(values, max(scale, float(values.max())))
-    found = []
-    for first, k, last in minima:
-        near = slice(k - 1, k + 2)
-        before, after = float(times[first]), float(times[last])
-        sides = values[[first, last]]
-        if not _lowest_bracketed(times[near], values[near]) < MINIMUM_DEPTH * sides.min():
-            continue
-        time, value = monitor.minimum(times[near], values[near])
-        if not value < MINIMUM_DEPTH * sides.min():
-            continue
-        if _along_curve(steps, time):
-            continue
-        certain = value < SINGULAR_VALUE * scale
-        kind = "passed"
-        if not certain and monitor.avoids(time):
-            kind = "avoided"
-        else:
-            cosine = _rank_loss_cosine(monitor, time, certain, before, after)
-            if cosine is None:
-                continue
-            if cosine > TURNED_BACK_COSINE and value > TOUCHING_VALUE * scale:
-                time, value = monitor.minimum(times[near], values[near], power=1)
-                if value > TOUCHING_VALUE * scale:
-                    continue
-        slope = float(max(sides[0] / (time - before), sides[1] / (after - time)))
-        found.append(crossing_at(monitor, steps, time, VELOCITY_VALUE * scale / slope, kind))
-    return found
+        if minima:
+            break
+    found = (_crossing_at(monitor, steps, one, scale, times, values) for one in minima)
+    return [crossing for crossing in found if crossing is not None]
+
+
+def _vanishes_once(
+    t: FloatArray, values: FloatArray, lowest: tuple[float, float], scale: float
+) -> bool:
+    """Whether the singular value with three samples at t (3,), values (3,) there, and the
+    ``lowest`` one between vanishes as it does at a single crossing: proportional to time."""
+    time, value = lowest
+    if not (value < SINGULAR_VALUE * scale and t[0] < time < t[2]):
+        return False
+    slopes = float(values[0]) / (time - float(t[0])), float(values[2]) / (float(t[2]) - time)
+    return max(slopes) < SLOPE_MARGIN * min(slopes)
+
+
+def _crossing_at(
+    monitor: ConstraintMonitor,
+    steps: StepData,
+    minimum: tuple[int, int, int],
+    scale: float,
+    times: FloatArray,
+    values: FloatArray,
+    lowest: tuple[float, float] | None = None,
+) -> Crossing | None:
+    """The crossing at a ``minimum`` of the ``values`` (n,) at ``times`` (n,), from
+    :func:`_minima`; None if it is none.  ``lowest``: its time and value, if they are known."""
+    first, k, last = minimum
+    near = slice(k - 1, k + 2)
+    before, after = float(times[first]), float(times[last])
+    sides = values[[first, last]]
+    if not _lowest_bracketed(times[near], values[near]) < MINIMUM_DEPTH * sides.min():
+        return None
+    time, value = lowest or monitor.minimum(times[near], values[near])
+    if not value < MINIMUM_DEPTH * sides.min() or _along_curve(steps, time):
+        return None
+    certain = value < SINGULAR_VALUE * scale
+    kind = "passed"
+    if not certain and monitor.avoids(time):
+        kind = "avoided"
+    else:
+        cosine = _rank_loss_cosine(monitor, time, certain, before, after)
+        if cosine is None:
+            return None
+        if cosine > TURNED_BACK_COSINE and value > TOUCHING_VALUE * scale:
+            time, value = monitor.minimum(times[near], values[near], power=1)
+            if value > TOUCHING_VALUE * scale:
+                return None
+    slope = float(max(sides[0] / (time - before), sides[1] / (after - time)))
+    return crossing_at(monitor, steps, time, VELOCITY_VALUE * scale / slope, kind)
 
 
 def _lowest_bracketed(t: FloatArray, values: FloatArray) -> float:

@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from tests.support.backends import on_both
+from tests.support.backends import needs_kernel, on_both
 from tests.support.bundled import load
 from tests.support.mechanisms import floating_ring
 
@@ -23,6 +23,29 @@ def test_dense_output_is_as_accurate_as_the_steps(tableau: str, bound: float) ->
     q, v = coarse(t)
     assert np.abs(q - fine.q).max() < bound
     assert np.abs(v - fine.v).max() < 10 * bound
+
+
+@needs_kernel
+@pytest.mark.parametrize("name", ["four_bar", "stewart_platform", "slider_crank"])
+def test_readings_between_ends_of_steps_err_by_what_is_allowed(name: str) -> None:
+    """Against a run a thousand times as accurate; they take fewer evaluations."""
+    mechanism, rtol = load(name), 1e-7
+    solution, exact = (srm.simulate(mechanism, 2.0, rtol=r) for r in (rtol, 1e-3 * rtol))
+    t = np.linspace(0.0, 2.0, 301)
+    units = mechanism.structure.units
+    allowed = rtol * np.concatenate([units.coordinate, units.coordinate * units.rate])
+    counts, found = [], []
+    for read in (lambda: solution.between_ends(t, allowed), lambda: solution.at(t)):
+        before = solution.system.evaluations
+        found.append(read())
+        counts.append(solution.system.evaluations - before)
+    assert counts[0] < 0.5 * counts[1]
+    states = [np.hstack([run.q, run.v]) for run in (*found, exact.at(t))]
+    ends, dense = (
+        np.abs(solution.observables.differences(states[2], own) / allowed).max()
+        for own in states[:2]
+    )
+    assert ends < dense + 1.0
 
 
 @pytest.mark.parametrize("tableau", ["fe", "trap", "heun", "tvd32", "erk4", "dopr54", "dop853"])

@@ -368,7 +368,7 @@ def turning_four_bar() -> tuple[srm.Mechanism, FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("rtol", [1e-4, 1e-5, 1e-6])
+@pytest.mark.parametrize("rtol", [3e-4, 1e-4, 1e-6])
 def test_joints_that_turn_back_against_friction_keep_the_tolerance(
     turning_four_bar: tuple[srm.Mechanism, FloatArray, FloatArray], rtol: float, backend: str
 ) -> None:

@@ -301,10 +301,13 @@ def test_copies_of_a_run_say_the_same_wherever_they_are_read(
     run = srm.simulate(srm.load(name), 2.0, backend=backend)
     t = np.linspace(0.0, 2.0, 31)
     before = copied(run)
-    exact = run(t)
+    exact, drift, energy, passages = run(t), run.drift, run.energy, run.crossings
     after = copied(run)
-    for other in (before, after):
+    for other in (before, after, copied(run.at(run.t))):
         assert np.array_equal(other(t), exact)
+        assert np.array_equal(other.drift, drift)
+        assert np.array_equal(other.energy, energy)
+        assert [one.time for one in other.crossings] == [one.time for one in passages]
         for loop, forces in run.reactions.items():
             assert np.array_equal(other.reactions[loop], forces)
 

@@ -57,6 +57,7 @@ namespace srm {
     field(double, reversal_share)          /* error of a jump in a step, over step times jump */   \
     field(double, friction_layer)          /* rates of full friction (friction speeds) */          \
     field(double, layer_landing)           /* rate up to which a step ends beside it (layers) */   \
+    field(double, layer_approached)        /* rate of steps whose stages miss one, over the first */ \
     field(double, layer_unresolved)        /* change of a rate that misses one (layers) */         \
     field(double, difference)              /* by a coordinate, over its size */                    \
     field(double, time_difference)         /* by time, over the step */                            \

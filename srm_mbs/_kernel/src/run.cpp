@@ -278,8 +278,14 @@ double Run::late_past_layers(const StepResult& r) const {
             const double scale = std::max(memory.state_scale[i], r.state_scale[i]);
             tolerance += std::abs(sum.coefficients[k]) * step.norm.weight(i, scale);
         }
+        std::pair<double, double> stages(inf, -inf);
+        const std::size_t width = 2 * system.nv;
+        for (std::size_t at = 0; at + width < r.rates.size(); at += width) {
+            const double rate = sum.of(&r.rates[at]);
+            stages = {std::min(stages.first, rate), std::max(stages.second, rate)};
+        }
         late = std::max(late, late_past_layer(r.h, sum.of(memory.rate.data()),
-                                              sum.of(r.end_rate.data()),
+                                              sum.of(r.end_rate.data()), stages,
                                               system.friction_speed(), tolerance, constants()));
     }
     return late;

@@ -29,8 +29,10 @@ EVEN_TIMES = 501
 """Number of evenly spaced times at which they are compared as well, by dense output."""
 FEWEST_EVEN_TIMES = 25
 """Fewest of them where each costs further stages; up to a fifth of the steps is read then."""
-READING_ERROR = 0.1
+READING_ERROR = 2e-3
 """Largest error of reading a rerun between its steps, over the tolerance of the one before it."""
+READING_MARGIN = 5.0
+"""Difference of two runs, over that error, below which they are read by dense output."""
 JUMP_MARGIN = 1e-9
 """Part of the run on either side of a jump of the state that is left out."""
 TIGHTEST_RATIO = 1e-2
@@ -246,23 +248,25 @@ def estimate_error(
     bound = tightest is solution
     partner = runs[-2][1] if bound else tightest
     times = sample_times(solution)
-    looser = [setting for setting, _ in runs[:-1]]
-    readings = Readings(solution, None if fixed else READING_ERROR * min(looser))
-    whole = compare(solution, partner, times, readings)
-    apart = whole.until(DISAGREEMENT)
-    kept = whole
-    if apart is not None:
-        kept = compare(solution, partner, times[times < apart], readings)
     # A scheme has its order at the ends of steps only; the coarsest grid is a subset of the others.
-    grid = sample_times(runs[0][1], fixed=True) if fixed else times
-    grid = grid if apart is None else grid[grid < apart]
-    differences = [
-        # Adaptive runs were compared with their partner on this grid already.
-        kept.largest
-        if {id(run), id(tightest)} == {id(solution), id(partner)} and not fixed
-        else compare(run, tightest, grid, readings).largest
-        for _, run in runs[:-1]
-    ]
+    whole_grid = sample_times(runs[0][1], fixed=True) if fixed else times
+    errors = [] if fixed else [READING_ERROR * min(setting for setting, _ in runs[:-1])]
+    for reading_error in (*errors, None):
+        readings = Readings(solution, reading_error)
+        kept = whole = compare(solution, partner, times, readings)
+        grid, apart = whole_grid, whole.until(DISAGREEMENT)
+        if apart is not None:
+            kept = compare(solution, partner, times[times < apart], readings)
+            grid = whole_grid[whole_grid < apart]
+        differences = [
+            # Adaptive runs were compared with their partner on this grid already.
+            kept.largest
+            if {id(run), id(tightest)} == {id(solution), id(partner)} and not fixed
+            else compare(run, tightest, grid, readings).largest
+            for _, run in runs[:-1]
+        ]
+        if reading_error is not None and min(differences) > READING_MARGIN * reading_error:
+            break
     order = observed_order([setting for setting, _ in runs], differences)
     beyond = 1.0
     if fixed and order is not None and order > SMALLEST_ORDER:

@@ -64,6 +64,9 @@ CLEAR_GAP = 100.0
 VANISHING = 100.0
 """Singular values up to this multiple of the smallest vanish with it."""
 
+ORTHOGONAL = 1e-12
+"""Cosine of two vectors below which they are orthogonal but for rounding."""
+
 LEAST_VALUE = 1e-9
 """Singular values below this vanish."""
 
@@ -538,6 +541,11 @@ class SingularValues:
         combinations = algebra.combinations(A)
         others = np.diag(combinations) == 0.0
         null = (np.eye(len(A)) - combinations)[others].T
+        gram = null.T @ null
+        size = np.sqrt(np.diag(gram))
+        # Of loops that lose rank each by themselves the columns are orthogonal.
+        if (np.abs(gram - np.diag(size**2)) < ORTHOGONAL * np.outer(size, size)).all():
+            return null / size, algebra.complement()
         return np.linalg.qr(null)[0], algebra.complement()
 
     def _of_one(self, A: FloatArray, k: int) -> float:

@@ -105,6 +105,7 @@ def constants() -> Any:
         reversal_share=stiffness.REVERSAL_SHARE,
         friction_layer=reversals.LAYER,
         layer_landing=reversals.LANDING,
+        layer_approached=reversals.APPROACHED,
         layer_unresolved=reversals.UNRESOLVED,
         difference=linear_split_step.DIFFERENCE,
         time_difference=linear_split_step.TIME_DIFFERENCE,

@@ -19,7 +19,7 @@ from srm_mbs.dynamics.constraints.rheonomic import all_rows
 from srm_mbs.dynamics.constraints.row_algebra import INERT, SingularValues, active_rows
 from srm_mbs.dynamics.forces import ForceKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.observables import Observables
 from srm_mbs.integration.kernel.marshalling import force_struct, system_struct
 from srm_mbs.integration.kernel.system import KEPT, workspace
@@ -52,6 +52,10 @@ class CompiledObservables(Observables):
     """:class:`~srm_mbs.dynamics.observables.Observables`, evaluated by the kernel."""
 
     _separated: tuple[ClosureGeometry, tuple[Any, Any, int] | None] | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Without workspaces; a copy may be loaded where there is no kernel.
+        return _loaded, (self.system,)
 
     @cached_property
     def _idle(self) -> deque[Any]:
@@ -200,6 +204,10 @@ class CompiledObservables(Observables):
                 return super()._powers(elements, t, q, v, resting)
             powers |= dict(zip(compiled, found.T))
         return {name: powers[name] for name in elements}
+
+
+def _loaded(system: OpenSystem | ClosedSystem) -> Observables:
+    return (Observables if core is None else CompiledObservables)(system)
 
 
 def _separated_rows(

@@ -204,6 +204,12 @@ FORCES = {
         damping=3.0,
         rest_length=0.0,
     ),
+    "rope": srm.SpringDamper(
+        srm.Anchor("body_4", xyz=(0.1, 0.2, 0.3)), srm.Anchor("world"), 40.0, 3.0, 0.0, slack=0.1
+    ),
+    "friction and slack": srm.CouplingSpring(
+        ("j1",), (0.8,), 30.0, 0.5, 0.1, slack=0.2, friction=2.0
+    ),
     "torque": srm.JointTorque("j1", 2.5),
     "torque over time": srm.JointTorque("j1", 2.5, law=srm.Sine(1.0, frequency_hz=2.0)),
     "torsion": srm.TorsionSpring("j1", stiffness=4.0, damping=0.3, rest_angle=0.2),

@@ -231,7 +231,14 @@ FORCES = {
 }
 
 
-@pytest.mark.parametrize("name", FORCES)
+RARE = ("rope", "torque over time")
+"""Each costs a compilation; others have the same parts of code."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.stress] if name in RARE else []) for name in FORCES],
+)
 def test_forces_of_elements_are_those_of_the_kernel(name: str) -> None:
     plain = _ring("point_on_plane", True)
     with_force = srm.Mechanism(plain.model, plain.loops, q0=plain.q0, forces=[FORCES[name]])

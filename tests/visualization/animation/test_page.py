@@ -938,7 +938,10 @@ def test_what_would_be_drawn_nowhere_is_refused_before_the_run(options: list[str
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize(("size", "aside"), [((730, 500), True), ((360, 640), False)])
+@pytest.mark.parametrize(
+    ("size", "aside"),
+    [((730, 500), True), pytest.param((360, 640), False, marks=pytest.mark.stress)],
+)
 def test_the_motion_is_beside_or_below_the_panel(
     browser: Any, tmp_path: Path, size: tuple[int, int], aside: bool
 ) -> None:

@@ -442,8 +442,6 @@ def _forces(numbers: _Numbers, forces: Sequence[Mapping[str, Any]]) -> dict[str,
         ends = int(a[0]), int(b[0]), numbers.rotated(a[1].tolist()), numbers.rotated(b[1].tolist())
         moves = tuple(columns.tolist()), numbers.take(support[columns].tolist(), units=True)
         own = np.asarray(force.get("numbers", ()))
-        if force["kind"] in (SPRING_DAMPER, COUPLING) and own.size:
-            raise UnsupportedElementError("a spring has slack or friction")
         if force["kind"] == BUSHING:
             acts = (own[:6] > 0.0) | (own[6:] > 0.0)
             law_of = np.where(acts, held + np.cumsum(acts) - 1, -1)
@@ -453,7 +451,7 @@ def _forces(numbers: _Numbers, forces: Sequence[Mapping[str, Any]]) -> dict[str,
             held += int(acts.sum())
             continue
         has_law = force["kind"] == COUPLING or (
-            force["kind"] == SPRING_DAMPER and force["rest"] > 0.0
+            force["kind"] == SPRING_DAMPER and (force["rest"] > 0.0 or own.size)
         )
         curves = len(force.get("curves", ()))
         out.append(

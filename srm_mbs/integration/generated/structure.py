@@ -298,8 +298,11 @@ def _rounded(x: float) -> float:
     return float(nearest) if abs(x - nearest) <= ROUNDING else float(x)
 
 
+_UPPER = np.triu_indices(3)
+
+
 def _inertia(body: pin.Inertia) -> list[float]:
-    moments = body.inertia[np.triu_indices(3)]
+    moments = body.inertia[_UPPER]
     moments[np.abs(moments) <= ROUNDING * np.abs(moments).max()] = 0.0
     tensor: list[float] = moments.tolist()
     if body.mass == 0.0:

@@ -104,10 +104,10 @@ def outline(points: FloatArray) -> list[tuple[int, int]]:
 
     A. M. Andrew, Information Processing Letters 9 (1979) 216.
     """
+    if len(points) == 2:
+        return [(0, 1)]
     at = points.tolist()
     order = sorted(range(len(at)), key=at.__getitem__)
-    if len(at) == 2:
-        return [(order[0], order[1])]
     rounding = COLLINEAR * float(np.ptp(points, axis=0).max()) ** 2
 
     def chain(indices: Iterable[int]) -> list[int]:

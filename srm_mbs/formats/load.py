@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from srm_mbs.dynamics.constraints.structure import ReusableAnalysis
+from srm_mbs.dynamics.constraints.reusable_analysis import ReusableAnalysis
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError, get_logger, naming, safe_repr
 from srm_mbs.formats.build import Reading, assembled

@@ -288,8 +288,14 @@ class _Numbers:
 
     def rotated(self, placement: Sequence[float]) -> Span:
         """Append a placement (12); of its rotation, what is rounding is left out."""
-        span = self.take([_rounded(x) for x in placement[:9]], units=True)
+        rotation = list(placement[:9])
+        if rotation != _UNTURNED:
+            rotation = [_rounded(x) for x in rotation]
+        span = self.take(rotation, units=True)
         return Span(span.start, span.length + self.take(placement[9:]).length)
+
+
+_UNTURNED = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
 def _rounded(x: float) -> float:

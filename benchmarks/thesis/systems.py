@@ -222,6 +222,13 @@ class CartesianPendulum:
         """|g|."""
         return abs(float(state[:2] @ state[:2]) - 1.0)
 
+    friction_speed = np.inf
+
+    @property
+    def friction_sums(self) -> FloatArray:
+        """None: there is no friction."""
+        return np.zeros((0, self.multiplier_part.start))
+
     def friction_tolerance(self, v: FloatArray) -> FloatArray:
         return np.full(self.tangent_size, np.inf)
 

@@ -156,8 +156,9 @@ def simulate(
         list[str] | None,
         several(
             "--point",
-            playback.POINT,
-            "Add the motion of this point of a link (m, in the link's frame) to the table.",
+            playback.NAMED_POINT,
+            "Add the motion of this point, by its name or of a link (m, in the link's frame), to "
+            "the table.",
         ),
     ] = None,
     html: Html = None,

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from srm_mbs.visualization.animation.live import LiveView
 
 POINT = "LINK:X,Y,Z"
+NAMED_POINT = f"NAME|{POINT}"
 """Form of a point of a link; coordinates in m, in the link's frame."""
 Image = Annotated[Path | None, option("FILE.png", "Write a picture of the run at the time --at.")]
 At = Annotated[

@@ -20,7 +20,7 @@ from srm_mbs.cli.output import (
     several,
     table,
 )
-from srm_mbs.cli.playback import POINT, points_or_names
+from srm_mbs.cli.playback import NAMED_POINT, points_or_names
 from srm_mbs.errors import InputError
 
 
@@ -59,8 +59,9 @@ def plot(
         list[str] | None,
         several(
             "--point",
-            POINT,
-            "Draw this point of a link (m, in the link's frame), with path, point and poses.",
+            NAMED_POINT,
+            "Draw this point, by its name or of a link (m, in the link's frame), with path, point "
+            "and poses.",
         ),
     ] = None,
     accelerations: Annotated[

@@ -130,7 +130,8 @@ def row_units(mechanism: MechanismData, units: Units) -> FloatArray:
     the rounding of a large ratio nor the pitch of a screw makes it impossible to close.  Closure
     errors over these are pure numbers, independent of the unit of length.
     """
-    return _units_of(mechanism.loops, mechanism.model, units)
+    count = sum(loop.rows.count for loop in mechanism.loops)
+    return constraint_units(mechanism, units)[:count]
 
 
 def constraint_units(mechanism: MechanismData, units: Units) -> FloatArray:

@@ -18,7 +18,8 @@ from srm_mbs.assembly.assemble import consistent_start
 from srm_mbs.assembly.diagnosis import CORRECT_AXIS, inclined_axes
 from srm_mbs.assembly.implied_rows import without_implied_rows
 from srm_mbs.assembly.position import CONSTRAINT_TOLERANCE, limit_springs
-from srm_mbs.dynamics.constraints.structure import ReusableAnalysis, structure_of
+from srm_mbs.dynamics.constraints.reusable_analysis import ReusableAnalysis
+from srm_mbs.dynamics.constraints.structure import structure_of
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import (
     AssemblyError,

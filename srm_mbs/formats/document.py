@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from copy import deepcopy
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -73,3 +74,20 @@ class Document:
     @property
     def root_tag(self) -> str | None:
         return root_tag(self.text)
+
+
+class RepeatedDocument(Document):
+    """A document that is read for one variant after the other: its XML is parsed once, and copied,
+    because translations change it."""
+
+    @cached_property
+    def xml(self) -> Element:
+        root, notes = _parsed_once(self.text, self.file)
+        self.notes += notes
+        return deepcopy(root)
+
+
+@lru_cache(maxsize=2)
+def _parsed_once(text: str, file: str) -> tuple[Element, tuple[str, ...]]:
+    notes: list[str] = []
+    return parse_xml(text, file, notes), tuple(notes)

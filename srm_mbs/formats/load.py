@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from srm_mbs.dynamics.constraints.structure import ReusableAnalysis
+from srm_mbs.dynamics.constraints.reusable_analysis import ReusableAnalysis
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError, get_logger, naming, safe_repr
 from srm_mbs.formats.build import Reading, assembled
-from srm_mbs.formats.document import Document
+from srm_mbs.formats.document import Document, RepeatedDocument
 from srm_mbs.formats.registry import DESCRIPTION, LINKAGE, Format, find_format, of_key
 from srm_mbs.formats.toml.description import Description, check_description
 from srm_mbs.formats.toml.parameters import given_parameters, resolved
@@ -245,7 +245,9 @@ def _of_tables(
     key, name = description.model_file
     path = Path(own.file).parent / name
     if urdf is not None:
-        model = Document(urdf, str(path))
+        # With other values of parameters it is a variant, of several probably.
+        kind = RepeatedDocument if overrides.parameters else Document
+        model = kind(urdf, str(path))
     else:
         with naming(file=own.file, element=key):
             reach.check(path, "file")

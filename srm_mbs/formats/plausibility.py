@@ -9,7 +9,12 @@ from typing import Any
 import pinocchio as pin
 
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.scaling import anchor_points, is_angle, scene_diagonal
+from srm_mbs.dynamics.scaling import (
+    anchor_points,
+    coordinate_units,
+    is_angle,
+    scene_diagonal,
+)
 
 LARGEST_START = 4.0 * math.pi
 """Angle (rad) of a start above which it may be in degrees."""
@@ -39,7 +44,10 @@ def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:
     origin of the joint that moves it.
     """
     model = mechanism.model
-    scene = scene_diagonal(mechanism, mechanism.q0)
+    # Known from the analysis; 1 also where all points are one.
+    scene = coordinate_units(mechanism, mechanism.q0, mechanism.v0).length
+    if scene == 1.0:
+        scene = scene_diagonal(mechanism, mechanism.q0)
     sizes = [0.0] * model.njoints
     parents, places = list(model.parents), list(model.jointPlacements)
     ends = [(parents[joint], places[joint].translation) for joint in range(1, model.njoints)]

@@ -7,6 +7,7 @@ Every reader makes a :class:`Translation`; from there one path leads to the mech
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -111,7 +112,8 @@ class Translation:
 
     def __post_init__(self) -> None:
         if self.write is None:  # building the mechanism changes the tree
-            object.__setattr__(self, "write", partial(str, urdf_text(self.tree)))
+            kept = deepcopy(self.tree)
+            object.__setattr__(self, "write", partial(urdf_text, kept))
 
     @property
     def urdf(self) -> str:

@@ -48,11 +48,13 @@ class ReversalSearch:
         if not len(sums):
             return -np.inf
         weights = self._norm.weights(np.maximum(memory.state_scale, result.state_scale))[k:]
-        ends = sums @ memory.rate[:k], sums @ result.end_rate[:k], np.abs(sums) @ weights
-        at = sums @ result.rates[:-1, :k].T
+        befores, afters = sums @ memory.rate[:k], sums @ result.end_rate[:k]
+        stages, tolerances = result.rates[:-1, :k] @ sums.T, np.abs(sums) @ weights
         return max(
-            late_past_layer(result.h, before, after, stages, self._layer, tolerance)
-            for before, after, tolerance, stages in zip(*(each.tolist() for each in ends), at)
+            late_past_layer(result.h, before, after, of_stages, self._layer, tolerance)
+            for before, after, of_stages, tolerance in zip(
+                befores.tolist(), afters.tolist(), stages.T, tolerances.tolist()
+            )
         )
 
 

@@ -28,7 +28,8 @@ class Anchor:
     link
         Name of a link (a Pinocchio ``BODY`` frame), or ``"world"``.
     frame
-        Name of any Pinocchio frame, instead of ``link``.
+        Name of any Pinocchio frame, instead of ``link``.  After a link it may be ``xyz``:
+        ``Anchor("rod", (1.0, 0.0, 0.0))``.
     xyz : (3,) m
         Origin of the anchor in the link's or frame's own frame.
     rpy : (3,) rad
@@ -41,11 +42,14 @@ class Anchor:
     """
 
     link: str | None = None
-    frame: str | None = None
+    frame: str | Sequence[float] | None = None
     xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        if self.link is not None and isinstance(self.frame, tuple | list | np.ndarray):
+            object.__setattr__(self, "xyz", self.frame)
+            object.__setattr__(self, "frame", None)
         if (self.link is None) == (self.frame is None):
             raise InputError(
                 "an anchor needs either a link or a frame",

@@ -177,6 +177,10 @@ Owner = TypeVar("Owner", bound=ResultOwner, contravariant=True)
 Result = TypeVar("Result")
 
 
+_MISSING = object()
+"""In place of a result that is not there, which may be None."""
+
+
 class _Memoised(Generic[Owner, Result]):
     """A function of a mechanism whose result is kept with the mechanism; nothing may change it."""
 
@@ -189,12 +193,10 @@ class _Memoised(Generic[Owner, Result]):
 
     def __call__(self, mechanism: Owner) -> Result:
         results = getattr(mechanism, self._store)
-        try:
-            return results[self]  # type: ignore[no-any-return]
-        except KeyError:
-            pass
-        result = results[self] = self._function(mechanism)
-        return result
+        result = results.get(self, _MISSING)
+        if result is _MISSING:
+            result = results[self] = self._function(mechanism)
+        return result  # type: ignore[no-any-return]
 
     def kept(self, mechanism: Owner) -> Result | None:
         """The result, if it was computed or given before."""

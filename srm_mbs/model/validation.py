@@ -305,6 +305,8 @@ def checked_points(model: pin.Model, points: Any) -> dict[str, Anchor]:
         Unless every name is a text and every point an anchor on a link or frame of the model.
     """
     found: dict[str, Anchor] = {}
+    body = pin.FrameType.BODY
+    links = {frame.name for frame in model.frames if frame.type == body} if points else ()
     for name, anchor in named_values(points, "points").items():
         element = f"point {safe_repr(name)}"
         if not isinstance(name, str) or not isinstance(anchor, Anchor):
@@ -313,7 +315,8 @@ def checked_points(model: pin.Model, points: Any) -> dict[str, Anchor]:
                 element="points",
                 remedy='Give for example {"tip": srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))}',
             )
-        with naming(element=element):
-            anchor.resolve(model)
+        if anchor.link not in links:
+            with naming(element=element):
+                anchor.resolve(model)
         found[name] = anchor
     return found

@@ -11,7 +11,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints import structure as structures
-from srm_mbs.dynamics.constraints.structure import ReusableAnalysis
+from srm_mbs.dynamics.constraints.reusable_analysis import ReusableAnalysis
 
 FOUR_BAR = """format = 1
 name = "bars"

@@ -442,6 +442,16 @@ def test_an_anchor_on_a_frame_equals_the_same_anchor_on_its_link(kind: str) -> N
         assert_close(x, y, atol=1e-13)
 
 
+def test_an_anchor_on_a_link_takes_its_place_after_the_name() -> None:
+    place = (1.0, 0.0, 0.5)
+    for given in (place, list(place), np.array(place)):
+        assert Anchor("rod", given) == Anchor(link="rod", xyz=place)
+    with pytest.raises(srm.InputError, match="either a link or a frame"):
+        Anchor("rod", "tip")
+    with pytest.raises(srm.InputError, match="xyz must be 3 finite numbers"):
+        Anchor("rod", (1.0, 0.0))
+
+
 @every_row
 @every_place
 def test_wrenches_of_the_rows_do_the_work_that_the_multipliers_do(kind: str, place: str) -> None:

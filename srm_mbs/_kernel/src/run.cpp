@@ -271,7 +271,6 @@ Stop Run::attempt(StepDecision& decision) {
 // ReversalSearch.late in integration/reversals.py.
 double Run::late_past_layers(const StepResult& r) const {
     double late = -inf;
-    const std::size_t n = 2 * static_cast<std::size_t>(system.nv);
     for (const FrictionSum& sum : system.friction_sums()) {
         double tolerance = 0.0;
         for (std::size_t k = 0; k < sum.columns.size(); ++k) {
@@ -280,8 +279,9 @@ double Run::late_past_layers(const StepResult& r) const {
             tolerance += std::abs(sum.coefficients[k]) * step.norm.weight(i, scale);
         }
         std::pair<double, double> stages(inf, -inf);
-        for (std::size_t at = 0; at + n < r.rates.size(); at += n) {
-            const double rate = sum.of(r.rates.data() + at);
+        const std::size_t width = 2 * system.nv;
+        for (std::size_t at = 0; at + width < r.rates.size(); at += width) {
+            const double rate = sum.of(&r.rates[at]);
             stages = {std::min(stages.first, rate), std::max(stages.second, rate)};
         }
         late = std::max(late, late_past_layer(r.h, sum.of(memory.rate.data()),

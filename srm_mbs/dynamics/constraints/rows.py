@@ -220,10 +220,10 @@ def placement_numbers(placement: pin.SE3) -> FloatArray:
 def support(model: pin.Model, joint: int) -> FloatArray:
     """1.0 at the velocity components (nv,) that move ``joint``, else 0.0."""
     mask = np.zeros(model.nv)
-    for ancestor in model.supports[joint]:
-        if ancestor:
-            j = model.joints[int(ancestor)]
-            mask[j.idx_v : j.idx_v + j.nv] = 1.0
+    while joint:
+        first = model.idx_vs[joint]
+        mask[first : first + model.nvs[joint]] = 1.0
+        joint = int(model.parents[joint])
     return mask
 
 

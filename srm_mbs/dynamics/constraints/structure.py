@@ -82,12 +82,6 @@ RANK_GAP = 1e3
 """Smallest ratio of the smallest structural to the largest redundant pivot without a warning."""
 
 
-CHECKED_STEPS = 6
-"""Closed configurations, beside the start, in which an analysis of a variant is checked."""
-SIMILAR = 4.0
-"""Largest ratio of row norms, and of last pivots, of two mechanisms with one analysis."""
-
-
 class ManifoldSampler:
     """Closes loops and walks on the closure manifold.
 
@@ -619,87 +613,6 @@ def analyse(mechanism: MechanismData) -> Structure:
         tuple(notes),
         sampler.eliminations,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class ReusableAnalysis:
-    """The analysis of a mechanism, with what a short walk from its start finds, for variants of it:
-    mechanisms of the same topology with other numbers.
-
-    Attributes
-    ----------
-    structure
-        The analysis.
-    lengths : (rows,)
-        Largest norm of each row, over its scale, on the walk.
-    last_pivot
-        Median of the last structural pivot.
-    """
-
-    structure: Structure
-    lengths: FloatArray
-    last_pivot: float
-
-    @classmethod
-    def of(cls, mechanism: MechanismData) -> ReusableAnalysis | None:
-        """The analysis of ``mechanism``; None if its closures have no rank, or an uncertain one."""
-        structure = structure_of(mechanism)
-        walked = None if structure.notes else _walked(structure, mechanism)
-        if walked is None:
-            return None
-        return cls(structure, walked.largest, float(np.median(walked.last_pivots(structure.rank))))
-
-    def for_variant(self, mechanism: MechanismData) -> Structure | None:
-        """The analysis in the units of ``mechanism``, a variant; None where it is not valid.
-
-        It is valid if both have the same rows and, on the walk from the start of the variant, the
-        ranks of all rows and of those of the loops are those of the analysis, the same rows are
-        zero, and the norms of rows and the last pivot differ from those of the mechanism that was
-        analysed by the factor ``SIMILAR`` at most.  An analysis of the variant itself would then
-        differ in its scales alone, by about as much.
-
-        Raises
-        ------
-        EvaluationError
-            If the mass matrix is not positive definite where it is evaluated.
-        """
-        structure = self.structure
-        if structure.row_names != row_names(mechanism):
-            return None
-        walked = _walked(structure, mechanism)
-        if walked is None:
-            return None
-        used = structure.kept
-        ratios = walked.largest[used] / self.lengths[used]
-        ratios = np.append(ratios, np.median(walked.last_pivots(structure.rank)) / self.last_pivot)
-        if not (ratios.min() > 1.0 / SIMILAR and ratios.max() < SIMILAR):
-            return None
-        return structure.at(mechanism)
-
-
-def _walked(structure: Structure, mechanism: MechanismData) -> Samples | None:
-    """A walk of ``CHECKED_STEPS`` from the start of ``mechanism``, with the row scales of
-    ``structure``; None if it contradicts the ranks and zero rows of that, or finds nothing."""
-    rank = structure.rank
-    sampler = ManifoldSampler(mechanism, coordinate_units(mechanism, mechanism.q0, mechanism.v0))
-    sampler.scale, sampler.eliminations = structure.row_scale, structure.eliminations
-    start, error = sampler.close(mechanism.q0, CLOSING_STEPS)
-    if not rank or not error < CLOSED:
-        return None
-    rng = np.random.default_rng(0)
-    samples = sampler.explore(start, rng, 1, CHECKED_STEPS, mechanism.v0, sample_start=True)
-    loops = int((samples.of_loops > STRUCTURAL_PIVOT).sum(axis=1).max())
-    if int(samples.ranks().max()) != rank or loops != structure.loop_rank:
-        return None
-    in_use = samples.largest > ZERO_ROW
-    in_use[sampler.closed :] = True
-    if not np.array_equal(in_use, structure.kept) or not samples.largest[in_use].all():
-        return None
-    if rank < samples.pivots.shape[1]:
-        redundant = max(float(samples.pivots[:, rank:].max()), PIVOT_ZERO)
-        if float(samples.last_pivots(rank).min()) < RANK_GAP * redundant:
-            return None
-    return samples
 
 
 @per_start

@@ -15,7 +15,7 @@ from srm_mbs.formats.document import Document
 from srm_mbs.formats.graph.joint_graph import ROOT_JOINT
 from srm_mbs.formats.graph.spanning_tree_to_urdf import GraphTranslator
 from srm_mbs.formats.mjcf.actuators import ActuatorReader
-from srm_mbs.formats.mjcf.attributes import MjcfValues
+from srm_mbs.formats.mjcf.attributes import Attributes, MjcfValues
 from srm_mbs.formats.mjcf.bodies import BodyReader
 from srm_mbs.formats.mjcf.equality import EqualityReader
 from srm_mbs.formats.mjcf.keyframes import KeyframeReader
@@ -45,18 +45,24 @@ def _option(values: MjcfValues, nodes: list[Element]) -> tuple[FloatArray, set[i
         gravity = given.text("gravity", gravity)
         if given.text("actuatorgroupdisable"):
             groups |= set(map(int, given.numbers("actuatorgroupdisable", GROUPS).tolist()))
-        for key, (most, unit) in THIN.items():
-            if given.number(key) > most:
-                problem = f"the drag of a medium does not act, and its {key} is above {most} {unit}"
-                raise given.fault(problem, f"Remove {key} if the drag is negligible")
-            if given.number(key):
-                values.remark(f"the drag of the medium ({key}) does not act", "<option>")
         for flag in node.findall("flag"):
             off = {key for key, word in flag.attrib.items() if word == "disable"}
             values.off |= off.union(*(INCLUDED.get(key, ()) for key in off))
     if "gravity" in values.off:
         gravity = "0 0 0"
     return values.numbers(gravity, 3, "<option>", "gravity"), groups
+
+
+def _check_medium(values: MjcfValues, nodes: list[Element]) -> None:
+    """Refuse a medium in which bodies move, unless it is as thin as air."""
+    for node in nodes:
+        given = Attributes(values, node.attrib, "<option>")
+        for key, (most, unit) in THIN.items():
+            if given.number(key) > most:
+                problem = f"the drag of a medium does not act, and its {key} is above {most} {unit}"
+                raise given.fault(problem, f"Remove {key} if the drag is negligible")
+            if given.number(key):
+                values.remark(f"the drag of the medium ({key}) does not act", "<option>")
 
 
 def translate(document: Document, options: Options) -> Translation:
@@ -91,6 +97,8 @@ def translate(document: Document, options: Options) -> Translation:
         tree.world(node)
     if not tree.bodies:
         raise values.fault("<worldbody>", "there is no <body>", "Add one for every body")
+    if tree.order:
+        _check_medium(values, root.findall("option"))
     tree.rescale()
     tree.add_rotors()
     tree.resolve_springdampers()

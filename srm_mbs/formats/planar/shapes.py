@@ -104,10 +104,10 @@ def outline(points: FloatArray) -> list[tuple[int, int]]:
 
     A. M. Andrew, Information Processing Letters 9 (1979) 216.
     """
+    if len(points) == 2:
+        return [(0, 1)]
     at = points.tolist()
     order = sorted(range(len(at)), key=at.__getitem__)
-    if len(at) == 2:
-        return [(order[0], order[1])]
     rounding = COLLINEAR * float(np.ptp(points, axis=0).max()) ** 2
 
     def chain(indices: Iterable[int]) -> list[int]:
@@ -150,6 +150,12 @@ def slender(points: FloatArray) -> Slender:
     """The slender bars along the :func:`outline` of points (n, 2)."""
     # With plain numbers, because NumPy takes ten times as long for so few.
     at = points.tolist()
+    if len(at) == 2:
+        (a, b), (c, d) = at
+        p, q = c - a, d - b
+        xx, xy, yy = p * p / 12.0, p * q / 12.0, q * q / 12.0
+        tensor = np.array([[yy, 0.0, -xy], [0.0, xx + yy, 0.0], [-xy, 0.0, xx]])
+        return Slender(math.hypot(p, q), np.array([0.5 * (a + c), 0.5 * (b + d)]), tensor)
     ends = [(*at[i], *at[j]) for i, j in outline(points)]
     parts = [math.hypot(c - a, d - b) for a, b, c, d in ends]
     length = math.fsum(parts)

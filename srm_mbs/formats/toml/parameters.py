@@ -11,7 +11,8 @@ import ast
 import keyword
 import math
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from copy import copy
 from functools import lru_cache
 from typing import Any
 
@@ -29,6 +30,9 @@ PARAMETERS = "parameters"
 """Key of the table of parameters, and the element of faults of values that are given instead."""
 TABLE = "[parameters]"
 """The element of faults of the table."""
+
+Place = tuple[str | int, ...]
+"""Keys and indices that lead to a value of a description."""
 
 BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
@@ -89,7 +93,8 @@ def resolved(
     try:
         known = _Parameters(entries.get(PARAMETERS, {}), given)
         rest = {key: value for key, value in entries.items() if key != PARAMETERS}
-        numbers = {key: known.in_place(value, key) for key, value in rest.items()}
+        places = _expressions(_Tables(entries)) if PARAMETERS in entries else _places(rest, ())
+        numbers = known.in_place(rest, places)
         values = known.values()
     except InputError as error:
         error.file = error.file or file
@@ -151,21 +156,21 @@ class _Parameters:
         """All values, in the order of the file."""
         return {name: self._value(name) for name in self._table}
 
-    def in_place(self, value: Any, *key: str | int) -> Any:
-        """``value`` of ``key``, part by part, with numbers in place of its expressions."""
-        kind = type(value)
-        if kind is float or kind is int:
-            return value
-        if is_expression(value):
+    def in_place(self, tables: dict[str, Any], places: Iterable[Place]) -> dict[str, Any]:
+        """``tables`` with numbers in place of the expressions at ``places``; what has none is not
+        copied."""
+        out = dict(tables)
+        copies: dict[Place, Any] = {(): out}
+        for place in places:
+            inside: Any = out
+            for k, part in enumerate(place[:-1], 1):
+                if place[:k] not in copies:
+                    copies[place[:k]] = inside[part] = copy(inside[part])
+                inside = copies[place[:k]]
             self.changed = True
-            first, *parts = key
-            inside = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in parts)
-            return self._evaluated(value, f"{first}{''.join(inside)}")
-        if isinstance(value, dict):
-            return {name: self.in_place(part, *key, name) for name, part in value.items()}
-        if isinstance(value, list):
-            return [self.in_place(part, *key, i) for i, part in enumerate(value)]
-        return value
+            key = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in place[1:])
+            inside[place[-1]] = self._evaluated(inside[place[-1]], f"{place[0]}{''.join(key)}")
+        return out
 
     def _value(self, name: str) -> float:
         """The value of a parameter that there is."""
@@ -285,6 +290,37 @@ class _Parameters:
                 remedy=f"Give it {wanted}",
             )
         return float(function(*arguments))
+
+
+class _Tables:
+    """The tables of a description, as a key: variants of a description have the same object."""
+
+    def __init__(self, entries: Mapping[str, Any]) -> None:
+        self.entries = entries
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Tables) and self.entries is other.entries
+
+    def __hash__(self) -> int:
+        return id(self.entries)
+
+
+@lru_cache(maxsize=4)
+def _expressions(tables: _Tables) -> tuple[Place, ...]:
+    """Where the tables have expressions, but for those of parameters."""
+    rest = {key: value for key, value in tables.entries.items() if key != PARAMETERS}
+    return tuple(_places(rest, ()))
+
+
+def _places(value: Any, place: Place) -> Iterator[Place]:
+    if is_expression(value):
+        yield place
+    elif isinstance(value, dict):
+        for name, part in value.items():
+            yield from _places(part, (*place, name))
+    elif isinstance(value, list):
+        for i, part in enumerate(value):
+            yield from _places(part, (*place, i))
 
 
 @lru_cache(maxsize=MOST_PARAMETERS)

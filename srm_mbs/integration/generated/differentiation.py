@@ -103,6 +103,10 @@ def _cosine(node: Expression, rates: list[Expression]) -> Expression:
     return -(node.recorder.call("sin", node.operands[0]) * rates[0])
 
 
+def _hyperbolic_tangent(node: Expression, rates: list[Expression]) -> Expression:
+    return (1.0 - node * node) * rates[0]
+
+
 def _absolute(node: Expression, rates: list[Expression]) -> Expression:
     sign = node.recorder.call("copysign", node.recorder.one, node.operands[0])
     return sign * rates[0]
@@ -134,6 +138,7 @@ _RULES: dict[str, Callable[[Expression, list[Expression]], Expression]] = {
     "sqrt": _square_root,
     "sin": _sine,
     "cos": _cosine,
+    "tanh": _hyperbolic_tangent,
     "fabs": _absolute,
     "fmax": _larger,
     "fmin": _smaller,

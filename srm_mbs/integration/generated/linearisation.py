@@ -28,7 +28,7 @@ from srm_mbs.integration.generated.differentiation import (
     derivatives,
 )
 from srm_mbs.integration.generated.expressions import Expression, Output, write_c
-from srm_mbs.integration.generated.structure import ZERO, Bushing, Structure
+from srm_mbs.integration.generated.structure import COUPLING, ZERO, Bushing, Structure
 from srm_mbs.integration.generated.terms import Row, Trace
 from srm_mbs.integration.generated.vectors import (
     Vector,
@@ -183,6 +183,12 @@ def linearisation_of(structure: Structure) -> Linearisation:
 def _damped(structure: Structure) -> bool:
     """Whether damping or friction acts on a coordinate, or an element damps."""
     dampers = [force.coefficients.start + 1 for force in structure.forces]
+    # Numbers of coupling springs are slack, friction and its speed.
+    dampers += [
+        force.numbers.start + 1
+        for force in structure.forces
+        if force.kind == COUPLING and force.numbers.length
+    ]
     for bushing in structure.bushings:
         dampers += range(bushing.coefficients.start + 6, bushing.coefficients.start + 12)
     return structure.passive or any(structure.codes[place] != ZERO for place in dampers)

@@ -288,8 +288,14 @@ class _Numbers:
 
     def rotated(self, placement: Sequence[float]) -> Span:
         """Append a placement (12); of its rotation, what is rounding is left out."""
-        span = self.take([_rounded(x) for x in placement[:9]], units=True)
+        rotation = list(placement[:9])
+        if rotation != _UNTURNED:
+            rotation = [_rounded(x) for x in rotation]
+        span = self.take(rotation, units=True)
         return Span(span.start, span.length + self.take(placement[9:]).length)
+
+
+_UNTURNED = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
 def _rounded(x: float) -> float:
@@ -298,8 +304,11 @@ def _rounded(x: float) -> float:
     return float(nearest) if abs(x - nearest) <= ROUNDING else float(x)
 
 
+_UPPER = np.triu_indices(3)
+
+
 def _inertia(body: pin.Inertia) -> list[float]:
-    moments = body.inertia[np.triu_indices(3)]
+    moments = body.inertia[_UPPER]
     moments[np.abs(moments) <= ROUNDING * np.abs(moments).max()] = 0.0
     tensor: list[float] = moments.tolist()
     if body.mass == 0.0:
@@ -442,8 +451,6 @@ def _forces(numbers: _Numbers, forces: Sequence[Mapping[str, Any]]) -> dict[str,
         ends = int(a[0]), int(b[0]), numbers.rotated(a[1].tolist()), numbers.rotated(b[1].tolist())
         moves = tuple(columns.tolist()), numbers.take(support[columns].tolist(), units=True)
         own = np.asarray(force.get("numbers", ()))
-        if force["kind"] in (SPRING_DAMPER, COUPLING) and own.size:
-            raise UnsupportedElementError("a spring has slack or friction")
         if force["kind"] == BUSHING:
             acts = (own[:6] > 0.0) | (own[6:] > 0.0)
             law_of = np.where(acts, held + np.cumsum(acts) - 1, -1)
@@ -453,7 +460,7 @@ def _forces(numbers: _Numbers, forces: Sequence[Mapping[str, Any]]) -> dict[str,
             held += int(acts.sum())
             continue
         has_law = force["kind"] == COUPLING or (
-            force["kind"] == SPRING_DAMPER and force["rest"] > 0.0
+            force["kind"] == SPRING_DAMPER and (force["rest"] > 0.0 or own.size)
         )
         curves = len(force.get("curves", ()))
         out.append(

@@ -594,7 +594,11 @@ class Trace:
             for factor, i, j in zip(factors, force.positions, force.columns):
                 stretch = stretch + factor * self.q[i]
                 rate = rate + factor * self.v[j]
-            value = self.acting(force.held, -(k * stretch + d * rate))
+            value = k * self._stretched(force, stretch) + d * rate
+            if force.numbers.length:
+                _, friction, speed = self.take(force.numbers)
+                value = value + friction * self.recorder.call("tanh", rate / speed)
+            value = self.acting(force.held, -value)
             return [(j, factor * value) for j, factor in zip(force.columns, factors)]
         point, acting, moment = (
             self._wrench(force) if kind == "wrench" else self._spring(force, k, d, rest)
@@ -642,6 +646,13 @@ class Trace:
         contact = x * x * x * (10.0 + x * (6.0 * x - 15.0))
         return -(contact * (k * beyond + d * rate))
 
+    def _stretched(self, force: Force, beyond: Expression) -> Expression:
+        """The stretch of a spring ``beyond`` its rest length, without its slack."""
+        if not force.numbers.length:
+            return beyond
+        call, slack = self.recorder.call, self.take(force.numbers)[0]
+        return beyond - call("fmin", call("fmax", beyond, self.recorder.zero), slack)
+
     def _frame(self, joint: int, placement: Span) -> tuple[Matrix, Vector]:
         body = self.body(joint)
         rotation, at = self.placement(placement)
@@ -672,8 +683,11 @@ class Trace:
         length = self.recorder.call("sqrt", dot(apart, apart))
         coincident = self.take(self.structure.coincident)[0]
         self.guards.append(Guard(length, coincident * rest))
-        line = scaled(1.0 / length, apart)
-        value = -(k * (length - rest) + d * dot(line, rate))
+        inverse = 1.0 / length
+        if force.numbers.length:  # the ends of a rope may meet
+            inverse = self.recorder.choose(length, inverse, self.recorder.zero)
+        line = scaled(inverse, apart)
+        value = -(k * self._stretched(force, length - rest) + d * dot(line, rate))
         return at_a, scaled(self.acting(force.held, value), line), self.nothing
 
     def _spring_without_length(

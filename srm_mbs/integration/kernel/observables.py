@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
@@ -48,6 +46,25 @@ def _idle_all_rows(mechanism: Mechanism) -> deque[Any]:
     return deque(maxlen=KEPT)
 
 
+class _Lent:
+    """A kernel system of all rows, for one user."""
+
+    __slots__ = ("_idle", "_kernel_system", "_mechanism")
+
+    def __init__(self, observables: CompiledObservables) -> None:
+        self._idle, self._mechanism = observables.idle, observables.mechanism
+
+    def __enter__(self) -> Any:
+        try:
+            self._kernel_system = self._idle.pop()  # two threads never get the same
+        except IndexError:
+            self._kernel_system = _make_all_rows(self._mechanism)
+        return self._kernel_system
+
+    def __exit__(self, *_: object) -> None:
+        self._idle.append(self._kernel_system)
+
+
 class CompiledObservables(Observables):
     """:class:`~srm_mbs.dynamics.observables.Observables`, evaluated by the kernel."""
 
@@ -58,24 +75,17 @@ class CompiledObservables(Observables):
         return _loaded, (self.system,)
 
     @cached_property
-    def _idle(self) -> deque[Any]:
+    def idle(self) -> deque[Any]:
+        """Kernel systems of all rows that nobody uses."""
         mechanism = self.mechanism
         # Drives start where the mechanism does, and results of large ones hold their workspace.
         if mechanism.drives or mechanism.model.nv > LARGE:
             return deque(maxlen=1)
         return _idle_all_rows(mechanism)
 
-    @contextmanager
-    def _all_rows(self) -> Iterator[Any]:
+    def _all_rows(self) -> _Lent:
         """A kernel system of :func:`_make_all_rows` for one user."""
-        try:
-            kernel_system = self._idle.pop()  # two threads never get the same
-        except IndexError:
-            kernel_system = _make_all_rows(self.mechanism)
-        try:
-            yield kernel_system
-        finally:
-            self._idle.append(kernel_system)
+        return _Lent(self)
 
     @property
     def _calls_python(self) -> bool:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import Any
 
 from srm_mbs._kernel import core
@@ -59,10 +58,9 @@ def idle_workspaces(mechanism: MechanismData) -> deque[Any]:
     return deque(maxlen=KEPT)
 
 
-@contextmanager
-def workspace(system: ClosedSystem | OpenSystem, code: Any = None) -> Iterator[Any]:
+class workspace:  # noqa: N801 - used as a function
     """A kernel system of ``system`` for one user: an idle one of its mechanism, or a new one;
-    ``code`` as for :func:`make_kernel_system`.
+    ``code`` as for :func:`make_kernel_system`.  A context manager, whose object it is.
 
     It returns to the pool afterwards, if it is :func:`shared` and there are not KEPT already.  One
     whose user raised is left to the garbage collector.
@@ -71,14 +69,27 @@ def workspace(system: ClosedSystem | OpenSystem, code: Any = None) -> Iterator[A
     on: its Python code between such calls may be in C++ of a library, where CPython's end of a
     daemon thread aborts the program.
     """
-    core.enter_python()  # type: ignore[union-attr]
-    try:
-        kernel_system = _idle_or_new(system, code)
-        yield kernel_system
-        if shared(system):
-            idle_workspaces(system.mechanism).append(kernel_system)
-    finally:
-        core.leave_python()  # type: ignore[union-attr]
+
+    __slots__ = ("_code", "_kernel_system", "_system")
+
+    def __init__(self, system: ClosedSystem | OpenSystem, code: Any = None) -> None:
+        self._system, self._code = system, code
+
+    def __enter__(self) -> Any:
+        core.enter_python()  # type: ignore[union-attr]
+        try:
+            self._kernel_system = _idle_or_new(self._system, self._code)
+        except BaseException:
+            core.leave_python()  # type: ignore[union-attr]
+            raise
+        return self._kernel_system
+
+    def __exit__(self, kind: Any, *_: object) -> None:
+        try:
+            if kind is None and shared(self._system):
+                idle_workspaces(self._system.mechanism).append(self._kernel_system)
+        finally:
+            core.leave_python()  # type: ignore[union-attr]
 
 
 def _idle_or_new(system: ClosedSystem | OpenSystem, code: Any) -> Any:

@@ -55,8 +55,8 @@ NEGLIGIBLE = 1e-9
 picture a moment."""
 NOTABLE = 1e-6
 """Part of a force or moment above which an indeterminate component makes it indeterminate."""
-MAX_NUMBERS = 90_000
-"""Components of all arrows together at all times: some 500 kB in a page."""
+MAX_NUMBERS = 75_000
+"""Components of all arrows together at all times: some 430 kB in a page."""
 FEWEST_TIMES = 50
 """Times of the arrows of very many joints."""
 LINK_FORCES = (SpringDamper, Bushing, Wrench)

@@ -205,12 +205,15 @@ class _Drawing:
         """
         animation, tracks = self.meshcat.animation, {}
         for name, rows in values.items():
-            # A constant value has one key: the pivot of a crank, the direction of a slider.
-            count = len(rows) if np.ptp(rows, axis=0).max() > 1e-12 else 1
+            kept = np.arange(len(rows))
+            if np.ptp(rows, axis=0).max() <= 1e-12:
+                # A constant value has one key: the pivot of a crank, the direction of a slider.
+                kept = kept[:1]
+            elif name in ("position", "quaternion"):
+                kept = kept[self.motion.needed_frames(rows)]
             kind = TRACK_TYPES.get(name, "vector3")
-            tracks[name] = animation.AnimationTrack(
-                name, kind, self.frames[:count], rows[:count].tolist()
-            )
+            frames = [self.frames[i] for i in kept.tolist()]
+            tracks[name] = animation.AnimationTrack(name, kind, frames, rows[kept].tolist())
             if name != "material.color":
                 node.set_property(name, rows[0].tolist())
         if any(len(track.frames) > 1 for track in tracks.values()):

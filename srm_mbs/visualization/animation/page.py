@@ -84,7 +84,7 @@ def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -
     dict
         Those of :func:`values_over_time` or :func:`values_over_crank`, and ``start`` (s),
         ``panel``, ``notes``, ``arrows``, ``bodies`` with the name of each node that has shapes,
-        ``ground``, ``aspect`` and ``background``.
+        ``ground``, ``aspect``, ``ends`` and ``background``.
     """
     times = picture.motion.times
     data: dict[str, Any] = {"times": [], "joint_times": [], "values": [], "passages": []}
@@ -100,6 +100,7 @@ def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -
         "bodies": _bodies(picture) if panel else [],
         "ground": _ground(picture) if panel else None,
         "aspect": ASPECT,
+        "ends": picture.view.ends,
         "background": BACKGROUNDS,
     }
 

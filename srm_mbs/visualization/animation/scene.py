@@ -58,11 +58,15 @@ class View:
         Unit vectors to the right, upwards and forward as its rows.
     distance
         From the camera to the target, m.
+    ends
+        Left, right and upper end of what is in view, from the middle, in half heights of the
+        picture.
     """
 
     target: FloatArray
     axes: FloatArray
     distance: float
+    ends: tuple[float, float, float] = (-ASPECT, ASPECT, 1.0)
 
 
 def choose_view(mechanism: Mechanism, points: FloatArray) -> View:
@@ -79,10 +83,15 @@ def choose_view(mechanism: Mechanism, points: FloatArray) -> View:
     seen = points @ axes.T
     centre = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
     offsets = seen - centre
-    slope = FILLED_PART * math.tan(math.radians(0.5 * FIELD_OF_VIEW))
+    half = math.tan(math.radians(0.5 * FIELD_OF_VIEW))
+    slope = FILLED_PART * half
     needed = np.abs(offsets[:, :2]) / [slope * ASPECT, slope] - offsets[:, 2:]
     distance = float(needed.max())
-    return View(centre @ axes, axes, distance if distance > SMALLEST_DISTANCE else 1.0)
+    if not distance > SMALLEST_DISTANCE:
+        return View(centre @ axes, axes, 1.0)
+    across, upwards = (offsets[:, :2] / (half * (distance + offsets[:, 2:]))).T
+    ends = float(across.min()), float(across.max()), float(upwards.max())
+    return View(centre @ axes, axes, distance, ends)
 
 
 def _view_direction(mechanism: Mechanism) -> FloatArray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -133,12 +133,15 @@ class BodyMotion:
         Origins of the joint frames in the world.
     quaternions : (n, k, 4)
         Their rotations, (x, y, z, w), of continuous sign.
+    parts
+        Into how many each interval of the requested key frames is divided for the fastest body.
     """
 
     joints: tuple[int, ...]
     times: FloatArray
     positions: FloatArray
     quaternions: FloatArray
+    parts: int = 1
 
     @property
     def rate(self) -> float:
@@ -152,6 +155,30 @@ class BodyMotion:
         """``times`` in units of 1/:attr:`rate` from the start: 0, 1, 2 ... if they are uniform."""
         numbers = ((self.times - self.times[0]) * self.rate).round(6).tolist()
         return [int(number) if number.is_integer() else number for number in numbers]
+
+    def needed_frames(self, rows: FloatArray) -> BoolArray:
+        """Which key frames (n,) are needed of a body that moves by ``rows``: the requested ones,
+        and as many between them as :data:`INTERPOLATION_TOLERANCE` demands.
+
+        Parameters
+        ----------
+        rows : (n, 3) m or (n, 4)
+            Its positions, or quaternions of continuous sign.
+        """
+        numbers = np.array(self.frames)
+        whole = numbers == np.round(numbers)
+        size = float(np.ptp(self.positions.reshape(-1, 3), axis=0).max(initial=0.0)) or 1.0
+        strides = [s for s in range(self.parts, 1, -1) if self.parts % s == 0]
+        for stride in strides:
+            kept: BoolArray = ~whole | (numbers % stride == 0)
+            between = np.column_stack(
+                [np.interp(numbers, numbers[kept], column[kept]) for column in rows.T]
+            )
+            off = np.linalg.norm(between - rows, axis=1)
+            # A small angle is twice the distance of unit quaternions.
+            if (2.0 * off if rows.shape[1] == 4 else off / size).max() <= INTERPOLATION_TOLERANCE:
+                return kept
+        return np.ones(len(numbers), dtype=bool)
 
     def path(self, joint: int, placement: pin.SE3) -> FloatArray:
         """Positions (n, 3) m in the world of a point fixed to a joint (0: the ground)."""
@@ -208,6 +235,7 @@ def sample_motion(
         parts = more
         times = np.linspace(start, end, parts * intervals + 1)
         sampled, needed = _sampled(motion, joints, times)
+    sampled = replace(sampled, parts=parts)
     if max(wanted, needed) > allowed:
         log.info(
             "%d bodies over %g s: %.3g key frames per second instead of %.3g",
@@ -220,6 +248,7 @@ def sample_motion(
     apart = [t for t in extra if np.abs(times - t).min() * sampled.rate > 1e-6]
     if not apart:
         return sampled
+    # Frames are numbered by a rate that the extra ones change: all are kept.
     return _sampled(motion, joints, np.union1d(times, apart))[0]
 
 

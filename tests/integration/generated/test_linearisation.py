@@ -73,6 +73,7 @@ OTHER_FORCES = (
     ),
     srm.TorsionSpring("j0", stiffness=4.0, damping=0.3, rest_angle=0.2),
     srm.LimitSpring("j2", lower=-0.3, upper=0.2, stiffness=50.0, damping=2.0, depth=0.4),
+    srm.CouplingSpring(("j0", "j2"), (1.0, -0.6), 30.0, 0.0, -0.2, slack=0.3, friction=2.0),
     srm.Bushing(_TIP, srm.Anchor("world"), stiffness=(0.0, 9.0, 0.0, 0.0, 2.0, 0.0)),
 )
 

@@ -214,6 +214,12 @@ FORCES = {
         damping=3.0,
         rest_length=0.0,
     ),
+    "rope": srm.SpringDamper(
+        srm.Anchor("body_4", xyz=(0.1, 0.2, 0.3)), srm.Anchor("world"), 40.0, 3.0, 0.0, slack=0.1
+    ),
+    "friction and slack": srm.CouplingSpring(
+        ("j1",), (0.8,), 30.0, 0.5, 0.1, slack=0.2, friction=2.0
+    ),
     "torque": srm.JointTorque("j1", 2.5),
     "torque over time": srm.JointTorque("j1", 2.5, law=srm.Sine(1.0, frequency_hz=2.0)),
     "torsion": srm.TorsionSpring("j1", stiffness=4.0, damping=0.3, rest_angle=0.2),
@@ -235,7 +241,14 @@ FORCES = {
 }
 
 
-@pytest.mark.parametrize("name", FORCES)
+RARE = ("rope", "torque over time")
+"""Each costs a compilation; others have the same parts of code."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.stress] if name in RARE else []) for name in FORCES],
+)
 def test_forces_of_elements_are_those_of_the_kernel(name: str) -> None:
     plain = _ring("point_on_plane", True)
     with_force = srm.Mechanism(plain.model, plain.loops, q0=plain.q0, forces=[FORCES[name]])

@@ -936,3 +936,29 @@ def test_what_would_be_drawn_nowhere_is_refused_before_the_run(options: list[str
     assert f"error: {options[0]}: it is drawn in the animation" in said
     assert "--html" in said
     assert "steps" not in said
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize(
+    ("size", "aside"),
+    [((730, 500), True), pytest.param((360, 640), False, marks=pytest.mark.stress)],
+)
+def test_the_motion_is_beside_or_below_the_panel(
+    browser: Any, tmp_path: Path, size: tuple[int, int], aside: bool
+) -> None:
+    """In a frame of a site the picture moves aside, on a phone there is room below the panel."""
+    links = {"A": (0, 0), "B": (0, 30), "C": (20, 30), "D": (20, 0)}
+    bars = {"left": ("A", "B"), "top": ("B", "C"), "right": ("C", "D")}
+    linkage = srm.planar(points=links, bars=bars, ground=("A", "D"), unit="mm", mass_per_length=1.0)
+    motion = srm.simulate(linkage, 0.02)
+    with exported(browser, tmp_path, motion, size, fps=50.0) as page:
+        page.wait_for_function(f"pane.clientWidth === {size[0]}")
+        box = page.locator("#panel").bounding_box()
+        corners = [page.evaluate(POINT_OF, [bar, [0.0, 0.0, 0.0]]) for bar in ("A", "B", "C")]
+        right, bottom = box["x"] + box["width"], box["y"] + box["height"]
+        assert all(x > right or y > bottom for x, y in corners)
+        moved = page.evaluate("viewer.camera.view.offsetX") < 0.0
+        assert moved == aside
+        # What is seen at a point is what lies there.
+        x, y = page.evaluate(POINT_OF, ["A", [0.01, 0.0, 0.0]])
+        assert page.evaluate(f"name_of(body_at({x}, {y}))") == "left"

@@ -185,6 +185,26 @@ def halfway(motion: trajectory.BodyMotion) -> tuple[Any, Any, Any]:
     return 0.5 * (motion.times[1:] + motion.times[:-1]), places, turned
 
 
+def test_slow_bodies_have_fewer_key_frames_than_fast_ones_and_are_seen_in_their_places() -> None:
+    solution = srm.simulate(load("jansen_walker"), 2.0)
+    motion = sample_motion(solution, moving(solution.mechanism), 60.0)
+    size = np.ptp(motion.positions.reshape(-1, 3), axis=0).max()
+    numbers, counts = np.arange(len(motion.times)), []
+    for k in range(len(motion.joints)):
+        for rows, scale in ((motion.positions[:, k], size), (motion.quaternions[:, k], 0.5)):
+            kept = motion.needed_frames(rows)
+            assert kept[:: motion.parts].all()  # the requested ones
+            between = np.array(
+                [np.interp(numbers, numbers[kept], column[kept]) for column in rows.T]
+            )
+            off = np.linalg.norm(between.T - rows, axis=1).max() / scale
+            assert off <= trajectory.INTERPOLATION_TOLERANCE
+            counts.append(kept.sum())
+    requested = (len(numbers) - 1) // motion.parts + 1
+    assert set(counts) == {requested, len(numbers)}
+    assert motion.parts == 2
+
+
 def test_bodies_of_a_short_fast_run_are_seen_in_their_places_between_key_frames() -> None:
     solution = srm.simulate(load("squeezing_mechanism"), 0.03)  # two turns of the crank
     joints = moving(solution.mechanism)

@@ -34,13 +34,31 @@ const pane = element("meshcat-pane");
 pane.setAttribute("aria-label", document.title);
 const set_size = viewer.set_3d_pane_size;  // of itself it takes the height of the window
 viewer.set_3d_pane_size = () => set_size.call(viewer, pane.clientWidth, pane.clientHeight);
-new ResizeObserver(() => { viewer.set_3d_pane_size(); fold_notes(); }).observe(pane);
+new ResizeObserver(() => {
+  viewer.set_3d_pane_size();
+  fold_notes();
+  make_room();
+}).observe(pane);
 let away = 1;
 function step_back() {
   const wanted = Math.max(1, about.aspect * pane.clientHeight / pane.clientWidth);
   if (Math.abs(wanted - away) < 1e-3) return;
   viewer.camera.position.multiplyScalar(wanted / away);
   away = wanted;
+  viewer.set_dirty();
+}
+
+// Where the panel would cover the motion, the picture moves aside as far as the window has room.
+const MARGIN = 12;  // pixels
+function make_room() {
+  const width = pane.clientWidth, height = pane.clientHeight, panel = element("panel");
+  if (!about.panel || !about.ends || !width || !height) return;
+  const part = 0.5 * height / Math.max(1, about.aspect * height / width);
+  const [left, right, upper] = about.ends.map((end) => part * end);
+  let aside = panel.offsetLeft + panel.offsetWidth + MARGIN - (0.5 * width + left);
+  aside = Math.max(0, Math.min(aside, 0.5 * width - MARGIN - right));
+  if (panel.offsetTop + panel.offsetHeight < 0.5 * height - upper) aside = 0;  // it is above
+  viewer.camera.setViewOffset(width, height, -aside, 0, width, height);
   viewer.set_dirty();
 }
 
@@ -88,6 +106,7 @@ function fill_panel() {
   }
   element("panel").hidden = !about.panel && !about.notes.length;
   fold_notes();
+  make_room();
 }
 
 // In a small window the notes would lie on the motion: there a button unfolds them.

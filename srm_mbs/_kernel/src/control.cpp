@@ -369,7 +369,7 @@ public:
             for (int j = k + 1; j < columns_; ++j) sum -= A_[j * rows_ + k] * coefficients[j];
             coefficients[k] = sum / diagonal_[k];
         }
-        return norm(&values[columns_], rows_ - columns_);
+        return norm(values.data() + columns_, rows_ - columns_);
     }
 
 private:

@@ -204,6 +204,7 @@ def test_without_cc_the_compiler_of_the_package_ziglang_is_taken(
     script = f'echo "$1 $ZIG_GLOBAL_CACHE_DIR" >> {seen}; shift; exec {shutil.which("cc")} "$@"'
     _write_program(zig, script)
     monkeypatch.setattr(code_cache, "_zig", lambda: str(zig))
+    monkeypatch.delenv("CC", raising=False)
     usual = code_cache.compiler.__wrapped__()
     assert Path(usual.command[0]).name == "cc"
     monkeypatch.setattr(code_cache, "compiler", code_cache.compiler.__wrapped__)

@@ -448,6 +448,8 @@ def assembled(reading: Reading) -> Mechanism:
     if reading.elements is None:
         description.refuse_identical_closures()
     mechanism, q, v = unassembled(reading)
+    if reading.analysis is not None and reading.model is not None:
+        reading.analysis.lend_rows(mechanism)
     try:
         if description.closing_tolerance:
             reduced, note = without_implied_rows(mechanism, description.closing_tolerance)

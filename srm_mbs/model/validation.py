@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.linalg.lapack import dpotrf
 
-from srm_mbs._kernel.workspace import workspace
+from srm_mbs._kernel.workspace import scratch
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, known_names, naming, safe_repr
 from srm_mbs.model.anchors import Anchor
@@ -107,8 +107,7 @@ def undetermined_joint(
     """
     with np.errstate(all="ignore"):
         # Of M the upper triangle counts: the lower one of what LAPACK reads.
-        data = workspace(model)
-        M = pin.crba(model, data, q)[::-1, ::-1]
+        M = pin.crba(model, scratch(model), q)[::-1, ::-1]
         size = np.sqrt(M.diagonal())
         scaled = M / size[:, None] / size
     if not np.isfinite(np.tril(M)).all():

@@ -11,6 +11,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO
+from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, unscaled_rows
 from srm_mbs.dynamics.constraints.structure import (
     CLOSED,
     CLOSING_STEPS,
@@ -23,7 +24,7 @@ from srm_mbs.dynamics.constraints.structure import (
     row_names,
     structure_of,
 )
-from srm_mbs.dynamics.scaling import coordinate_units
+from srm_mbs.dynamics.scaling import anchor_points, coordinate_units
 from srm_mbs.model.mechanism import MechanismData
 
 CHECKED_STEPS = 6
@@ -45,11 +46,14 @@ class ReusableAnalysis:
         Largest norm of each row, over its scale, on the walk.
     last_pivot
         Median of the last structural pivot.
+    rows
+        The rows of the closures, unscaled; only copies are evaluated.
     """
 
     structure: Structure
     lengths: FloatArray
     last_pivot: float
+    rows: DrivenKinematics
 
     @classmethod
     def of(cls, mechanism: MechanismData) -> ReusableAnalysis | None:
@@ -58,7 +62,18 @@ class ReusableAnalysis:
         walked = None if structure.notes else _walked(structure, mechanism)
         if walked is None:
             return None
-        return cls(structure, walked.largest, float(np.median(walked.last_pivots(structure.rank))))
+        last_pivot = float(np.median(walked.last_pivots(structure.rank)))
+        return cls(structure, walked.largest, last_pivot, unscaled_rows(mechanism))
+
+    def lend_rows(self, mechanism: MechanismData) -> None:
+        """Give ``mechanism``, a variant whose tree has the same bodies and joints, the rows with
+        the places of its own closures, where these alone differ."""
+        if mechanism.drives:
+            return  # points that they move are anchors, too
+        rows = self.rows.moved(mechanism.model, mechanism.loops)
+        if rows is not None:
+            unscaled_rows.keep(mechanism, rows)
+            anchor_points.keep(mechanism, rows.anchors())
 
     def for_variant(self, mechanism: MechanismData) -> Structure | None:
         """The analysis in the units of ``mechanism``, a variant; None where it is not valid.

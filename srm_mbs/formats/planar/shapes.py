@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -24,6 +25,8 @@ FIT_ITERATIONS = 100
 """Newton steps after which lengths are taken for impossible."""
 DIVERGED = 1e12
 """Coordinates over the largest of the lengths at which Newton's method has failed."""
+KEPT_SHAPES = 1024
+"""Bars whose slender bodies are kept: variants of a linkage have most of them in common."""
 COLLINEAR = 1e-12
 """Distance of points from a line, over the size of the bar, that is rounding."""
 PALETTE = (
@@ -150,7 +153,15 @@ class Slender:
 
 
 def slender(points: FloatArray) -> Slender:
-    """The slender bars along the :func:`outline` of points (n, 2)."""
+    """The slender bars along the :func:`outline` of points (n, 2); nothing may change the result,
+    which is the same object for the same points."""
+    return _slender(points.shape, points.tobytes())
+
+
+@lru_cache(maxsize=KEPT_SHAPES)
+def _slender(shape: tuple[int, ...], numbers: bytes) -> Slender:
+    """:func:`slender` from the bytes of the points, which tell signs of zeros apart."""
+    points = np.frombuffer(numbers).reshape(shape)
     at = points.tolist()  # plain numbers, as in own_axes
     if len(at) == 2:
         (a, b), (c, d) = at

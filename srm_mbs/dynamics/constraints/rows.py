@@ -299,6 +299,7 @@ class _LoopRows:
     def moved(self, model: pin.Model, loop: LoopClosure) -> _LoopRows | None:
         """The same rows between the places of ``loop``; None if these are on other bodies."""
         other = copy(self)
+        other.name = loop.name
         (joint_a, other.in_a), (joint_b, other.in_b) = loop.resolve(model)
         if (joint_a, joint_b) != (self.joint_a, self.joint_b):
             return None

@@ -90,7 +90,8 @@ class Drawing:
         self.entry = entry
         self.unit = LENGTH_UNITS[entry.unit]
         self.angle = math.radians(1.0) if entry.angle == "deg" else 1.0
-        self.points = {name: self.unit * np.array(at) for name, at in entry.points.items()}
+        self._drawn = self.unit * np.array(list(entry.points.values()), dtype=float)
+        self.points: dict[str, FloatArray] = dict(zip(entry.points, self._drawn))
         self.ground = tuple(entry.ground)
         self._check_names()
         self.bars: dict[str, PlanarBar] = {bar.name: bar for bar in entry.bar}
@@ -129,7 +130,7 @@ class Drawing:
     @cached_property
     def size(self) -> float:
         """Diagonal (m) of the drawing."""
-        return float(np.linalg.norm(np.ptp(np.array(list(self.points.values())), axis=0)))
+        return float(np.linalg.norm(np.ptp(self._drawn, axis=0)))
 
     def _check_ground(self) -> None:
         if not self.ground and all(slider.on for slider in self.entry.slider):
@@ -214,7 +215,7 @@ class Drawing:
     @cached_property
     def _places(self) -> dict[str, tuple[float, float]]:
         """The points as plain numbers."""
-        return {name: (float(x), float(y)) for name, (x, y) in self.points.items()}
+        return {name: (x, y) for name, (x, y) in zip(self.points, self._drawn.tolist())}
 
     def _apart(self, a: str, b: str) -> float:
         """Distance (m) of two points as drawn."""

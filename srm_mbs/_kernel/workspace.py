@@ -6,6 +6,9 @@ Nothing here uses them.
 
 from __future__ import annotations
 
+import threading
+from typing import Any
+
 import pinocchio as pin
 
 LARGE = 64
@@ -24,3 +27,20 @@ def workspace(model: pin.Model) -> pin.Data:
         if core is not None:
             return core.lean_data(model)
     return model.createData()
+
+
+_latest = threading.local()
+
+
+def scratch(model: pin.Model) -> pin.Data:
+    """A :func:`workspace` for one evaluation: the next call for ``model`` in this thread may return
+    the same one, so that nothing may refer to its arrays any longer then.
+
+    Loading evaluates several things once, and making a workspace takes longer than they do.
+    """
+    if model.nv > LARGE:
+        return workspace(model)
+    latest: tuple[Any, int, pin.Data] | None = getattr(_latest, "workspace", None)
+    if latest is None or latest[0] is not model or latest[1] != model.njoints:
+        latest = _latest.workspace = model, int(model.njoints), workspace(model)
+    return latest[2]

@@ -35,6 +35,7 @@ from srm_mbs.dynamics.constraints.projection import (
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import coordinate_parents, graph_order
 from srm_mbs.dynamics.constraints.rows import COINCIDENT
+from srm_mbs.dynamics.constraints.structure import rows_in_use
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.forces import (
     HALF_TURN_ROUNDING,
@@ -552,23 +553,9 @@ class OpenSystem(Mechanics):
 
 
 @per_model
-def _rows_in_use(mechanism: Mechanism) -> DrivenKinematics:
-    """The kept, scaled rows of closures and drives; systems copy their workspace."""
-    structure = mechanism.structure
-    return DrivenKinematics(
-        mechanism.model,
-        mechanism.loops,
-        mechanism.drives,
-        structure.row_scale,
-        structure.kept,
-        structure.eliminations,
-    )
-
-
-@per_model
 def _graph_order(mechanism: Mechanism) -> tuple[int, ...]:
     """The rows in use along the graph of the loops; () for few coordinates."""
-    return graph_order(_rows_in_use(mechanism).pattern(), coordinate_parents(mechanism.model))
+    return graph_order(rows_in_use(mechanism).pattern(), coordinate_parents(mechanism.model))
 
 
 @per_start
@@ -608,7 +595,7 @@ class ClosedSystem(Mechanics):
     def loops(self) -> DrivenKinematics:
         """The rows of closures and drives that are in use, with memory of their own."""
         curves = self.mechanism.drive_curves
-        return _rows_in_use(self.mechanism).copy_workspace().follow(curves)
+        return rows_in_use(self.mechanism).copy_workspace().follow(curves)
 
     @cached_property
     def _joined(self) -> ForceKinematics | None:

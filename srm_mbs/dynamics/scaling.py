@@ -13,7 +13,7 @@ from itertools import islice
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs._kernel.workspace import workspace
+from srm_mbs._kernel.workspace import scratch, workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
 from srm_mbs.dynamics.constraints.rheonomic import driven_closures
@@ -186,7 +186,7 @@ def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> 
 
 def _units_at(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> Units:
     model = mechanism.model
-    data = workspace(model)
+    data = scratch(model)
     pin.computeJointJacobians(model, data, q)
     length = _diagonal(mechanism, data) or 1.0
     coordinate = np.where(_angle_components(data), 1.0, length)
@@ -227,7 +227,7 @@ def _gyration(mechanism: MechanismData) -> float:
     """The largest radius of gyration (m) of a body about its centre of mass."""
     massive = [body for body in mechanism.model.inertias.tolist() if body.mass > 0.0]
     # Lumping and shifting may round the trace of a point mass to a negative number.
-    squares = [max(np.trace(body.inertia), 0.0) / body.mass for body in massive]
+    squares = [max(body.inertia.trace(), 0.0) / body.mass for body in massive]
     return float(np.sqrt(max(squares, default=0.0)))
 
 

@@ -404,13 +404,16 @@ def _advice(error: AssemblyError) -> str:
     )
 
 
-def _analysed(mechanism: Mechanism, analysis: ReusableAnalysis | None) -> None:
-    """Analyse a mechanism where its loops are closed, unless ``analysis``, that of another variant,
-    is valid for it."""
+def _analysed(mechanism: Mechanism, reading: Reading) -> None:
+    """Analyse a mechanism where its loops are closed, unless the analysis of another variant is
+    valid for it."""
+    analysis = reading.analysis
     if analysis is not None and structure_of.kept(mechanism) is None:
         structure = analysis.for_variant(mechanism)
         if structure is not None:
             structure_of.keep(mechanism, structure)
+            if reading.model is not None:
+                analysis.lend_rows_in_use(mechanism)
     _ = mechanism.structure
 
 
@@ -448,6 +451,8 @@ def assembled(reading: Reading) -> Mechanism:
     if reading.elements is None:
         description.refuse_identical_closures()
     mechanism, q, v = unassembled(reading)
+    if reading.analysis is not None and reading.model is not None:
+        reading.analysis.lend_rows(mechanism)
     try:
         if description.closing_tolerance:
             reduced, note = without_implied_rows(mechanism, description.closing_tolerance)
@@ -456,7 +461,7 @@ def assembled(reading: Reading) -> Mechanism:
         # The mass matrix has to be regular before the analysis factorises it.
         mechanism, joint = _with_rotors(consistent_start(mechanism, q, v).mechanism)
         if joint is None:
-            _analysed(mechanism, reading.analysis)
+            _analysed(mechanism, reading)
     except AssemblyError as error:
         error.remedy += _advice(error)
         if description.lock:

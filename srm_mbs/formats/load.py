@@ -295,7 +295,11 @@ def _known_linkage(reading: Reading, mechanism: Mechanism) -> KnownLinkage | Non
     if not reading.shape or changed or description.gravity_compensation:
         return None
     tree = KnownTree(reading.shape, model)
-    return KnownLinkage(tree, description, reading.entries, description.closures())
+    # Variants take over the rows of those that the mechanism has as they are described.
+    kept = {loop.name: loop for loop in mechanism.loops}
+    described = description.closures()
+    closures = tuple(kept[one.name] if kept.get(one.name) == one else one for one in described)
+    return KnownLinkage(tree, description, reading.entries, closures)
 
 
 def _of_file(path: Path, overrides: Overrides) -> Reading:

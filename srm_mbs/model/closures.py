@@ -395,6 +395,8 @@ class LoopClosure:
         out = object.__new__(type(self))  # all else has been checked
         own = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         out.__dict__.update(own, a=a, b=b)
+        if self.type != "distance" or self.length is not None:
+            out.__dict__["rows"] = self.rows  # in the axes of the anchors, wherever these are
         return out
 
     @property

@@ -6,13 +6,14 @@ A tree must be in Pinocchio's order of joints, and its inertias must determine i
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import pinocchio as pin
 from scipy.linalg.lapack import dpotrf
 
-from srm_mbs._kernel.workspace import workspace
+from srm_mbs._kernel.workspace import scratch
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, known_names, naming, safe_repr
 from srm_mbs.model.anchors import Anchor
@@ -20,6 +21,8 @@ from srm_mbs.model.numbers import finite_array, named_values
 
 ARTICULATED_INERTIA_TOLERANCE = 1e-13
 """Articulated inertia, over the composite one, below which it is rounding."""
+KEPT_MOTIONS = 16
+"""Random motions that are kept, by the number of coordinates."""
 
 LOADED = (
     ', or load it with massless="fix", which locks the joints of massless ends, or with '
@@ -57,8 +60,7 @@ def check_inertia(model: pin.Model, file: str | None = None) -> None:
             element=f"joint {model.names[joint]!r}",
             remedy=f"Give the moving end of the chain an <inertial>{LOADED if file else ''}",
         )
-    rng = np.random.default_rng(0)
-    q = pin.integrate(model, pin.neutral(model), rng.uniform(-1.0, 1.0, model.nv))
+    q = pin.integrate(model, pin.neutral(model), _motion(model.nv))
     at = undetermined_joint(model, q, file)
     if at is not None:
         raise InputError(
@@ -70,13 +72,20 @@ def check_inertia(model: pin.Model, file: str | None = None) -> None:
         )
 
 
+@lru_cache(maxsize=KEPT_MOTIONS)
+def _motion(size: int) -> FloatArray:
+    """A motion (size,) from the neutral configuration to one in general position; read-only."""
+    out = np.random.default_rng(0).uniform(-1.0, 1.0, size)
+    out.setflags(write=False)
+    return out
+
+
 def massless_ends(model: pin.Model) -> list[int]:
     """The joints that move neither mass, inertia nor armature of their own, from the root to the
     tips."""
     parents, moves = list(model.parents), [False] * model.njoints
     for joint in range(model.njoints - 1, 0, -1):
-        inertia = model.inertias[joint]
-        if moves[joint] or inertia.mass or inertia.inertia.trace():
+        if moves[joint] or _has_inertia(model.inertias[joint]):
             moves[joint] = moves[parents[joint]] = True
     return [
         joint
@@ -84,6 +93,10 @@ def massless_ends(model: pin.Model) -> list[int]:
         if not moves[joint]
         and not model.armature[model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]].all()
     ]
+
+
+def _has_inertia(body: pin.Inertia) -> bool:
+    return bool(body.mass or body.inertia.trace())
 
 
 def undetermined_joint(
@@ -107,8 +120,7 @@ def undetermined_joint(
     """
     with np.errstate(all="ignore"):
         # Of M the upper triangle counts: the lower one of what LAPACK reads.
-        data = workspace(model)
-        M = pin.crba(model, data, q)[::-1, ::-1]
+        M = pin.crba(model, scratch(model), q)[::-1, ::-1]
         size = np.sqrt(M.diagonal())
         scaled = M / size[:, None] / size
     if not np.isfinite(np.tril(M)).all():

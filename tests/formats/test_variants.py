@@ -12,6 +12,9 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints import structure as structures
 from srm_mbs.dynamics.constraints.reusable_analysis import ReusableAnalysis
+from srm_mbs.dynamics.constraints.rheonomic import unscaled_rows
+from srm_mbs.dynamics.constraints.rows import LoopKinematics
+from srm_mbs.dynamics.scaling import anchor_points
 
 FOUR_BAR = """format = 1
 name = "bars"
@@ -155,6 +158,24 @@ def test_a_variant_is_the_mechanism_of_a_load_bit_by_bit(
         assert getattr(variant, name) == getattr(fresh, name), name
     for name in ("q0", "v0"):
         assert np.array_equal(getattr(variant, name), getattr(fresh, name))
+
+
+def test_rows_of_a_variant_are_those_of_its_own_closures(bars: Path) -> None:
+    """They are those of the base in other places, not resolved against the tree again."""
+    variant = srm.load(bars).with_parameters(crank=0.45)
+    assert structures.rows_in_use.kept(variant) is not None
+    structure, loops = variant.structure, variant.loops
+    built = LoopKinematics(variant.model, loops)
+    in_use = LoopKinematics(
+        variant.model, loops, structure.row_scale, structure.kept, structure.eliminations
+    )
+    for rows, own in ((unscaled_rows(variant), built), (structures.rows_in_use(variant), in_use)):
+        (found,), (expected,) = rows.constants()["loops"], own.constants()["loops"]
+        for key, value in expected.items():
+            assert np.array_equal(found[key], value), key
+    points = [(joint, at.tolist()) for joint, at in anchor_points(variant)]
+    places = [anchor.resolve(variant.model) for anchor in loops[0].anchors]
+    assert points == [(joint, place.translation.tolist()) for joint, place in places]
 
 
 def test_a_variant_with_a_fault_is_refused_as_a_load_is(tmp_path: Path) -> None:

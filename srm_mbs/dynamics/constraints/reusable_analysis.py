@@ -11,6 +11,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO
+from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, unscaled_rows
 from srm_mbs.dynamics.constraints.structure import (
     CLOSED,
     CLOSING_STEPS,
@@ -21,9 +22,10 @@ from srm_mbs.dynamics.constraints.structure import (
     Samples,
     Structure,
     row_names,
+    rows_in_use,
     structure_of,
 )
-from srm_mbs.dynamics.scaling import coordinate_units
+from srm_mbs.dynamics.scaling import anchor_points, coordinate_units
 from srm_mbs.model.mechanism import MechanismData
 
 CHECKED_STEPS = 6
@@ -45,11 +47,15 @@ class ReusableAnalysis:
         Largest norm of each row, over its scale, on the walk.
     last_pivot
         Median of the last structural pivot.
+    rows, in_use
+        The rows of the closures, unscaled, and those that are kept, scaled.
     """
 
     structure: Structure
     lengths: FloatArray
     last_pivot: float
+    rows: DrivenKinematics
+    in_use: DrivenKinematics
 
     @classmethod
     def of(cls, mechanism: MechanismData) -> ReusableAnalysis | None:
@@ -58,7 +64,26 @@ class ReusableAnalysis:
         walked = None if structure.notes else _walked(structure, mechanism)
         if walked is None:
             return None
-        return cls(structure, walked.largest, float(np.median(walked.last_pivots(structure.rank))))
+        last_pivot = float(np.median(walked.last_pivots(structure.rank)))
+        rows, in_use = unscaled_rows(mechanism), rows_in_use(mechanism)
+        return cls(structure, walked.largest, last_pivot, rows, in_use)
+
+    def lend_rows(self, mechanism: MechanismData) -> None:
+        """Give ``mechanism``, a variant whose tree has the same bodies and joints, the unscaled
+        rows with the places of its own closures, where these alone differ."""
+        if mechanism.drives:
+            return  # points that they move are anchors, too
+        rows = self.rows.moved(mechanism.model, mechanism.loops)
+        if rows is not None:
+            unscaled_rows.keep(mechanism, rows)
+            anchor_points.keep(mechanism, rows.anchors())
+
+    def lend_rows_in_use(self, mechanism: MechanismData) -> None:
+        """The same with the rows in use, for a variant that has this analysis."""
+        if not mechanism.drives:
+            rows = self.in_use.moved(mechanism.model, mechanism.loops)
+            if rows is not None:
+                rows_in_use.keep(mechanism, rows)
 
     def for_variant(self, mechanism: MechanismData) -> Structure | None:
         """The analysis in the units of ``mechanism``, a variant; None where it is not valid.

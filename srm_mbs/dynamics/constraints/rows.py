@@ -271,7 +271,10 @@ class _LoopRows:
         self.support = support(model, self.joint_a) - support(model, self.joint_b)
         self.first_row = start
         self.count = len(self.directions) + len(self._distances) + len(self.alignments)
-        # The same in the axes of the joints, as plain floats.
+        self._take_places()
+
+    def _take_places(self) -> None:
+        """Find the rows in the axes of the joints, as plain floats."""
         self._at_a: list[float] = self.in_a.translation.tolist()
         self._at_b: list[float] = self.in_b.translation.tolist()
         self._d: list[list[float]] = (self.directions @ self.in_b.rotation.T).tolist()
@@ -292,6 +295,16 @@ class _LoopRows:
             "support": self.support,
             "first_row": self.first_row,
         }
+
+    def moved(self, model: pin.Model, loop: LoopClosure) -> _LoopRows | None:
+        """The same rows between the places of ``loop``; None if these are on other bodies."""
+        other = copy(self)
+        other.name = loop.name
+        (joint_a, other.in_a), (joint_b, other.in_b) = loop.resolve(model)
+        if (joint_a, joint_b) != (self.joint_a, self.joint_b):
+            return None
+        other._take_places()
+        return other
 
     def bind(self, data: pin.Data) -> None:
         """Read the bodies of ``data`` from now on."""
@@ -438,6 +451,7 @@ class LoopKinematics:
             if isinstance(resolved, _LoopRows):
                 self._anchored = m
         self._support = np.concatenate(supports)
+        self._row_sets = [loop.rows for loop in loops]
         place = (np.cumsum(mask) - 1).tolist()
         size = scale.tolist()
         self._eliminations = [
@@ -461,6 +475,33 @@ class LoopKinematics:
         other._loops = [loop.copy_workspace() for loop in self._loops]
         other._allocate()
         return other
+
+    def moved(self, model: pin.Model, loops: Sequence[LoopClosure]) -> Self | None:
+        """The same rows with the places of ``loops`` in ``model``, a tree of the same bodies and
+        joints; None where more than places of anchors differs, or might."""
+        sets = [loop.rows for loop in loops]
+        known = self._row_sets
+        if len(sets) != len(known) or any(a is not b for a, b in zip(sets, known)):
+            return None
+        found = [
+            rows.moved(model, loop) if isinstance(rows, _LoopRows) else None
+            for rows, loop in zip(self._loops, loops)
+        ]
+        if len(found) != len(loops) or None in found:  # joint rows, and closures without any
+            return None
+        other = copy(self)
+        other._loops = [rows for rows in found if rows is not None]
+        other._allocate()
+        return other
+
+    def anchors(self) -> list[tuple[int, FloatArray]]:
+        """Joint, and origin (3,) in its axes, of the anchors of all closures that have rows."""
+        return [
+            (joint, place.translation.copy())
+            for rows in self._loops
+            if isinstance(rows, _LoopRows)
+            for joint, place in ((rows.joint_a, rows.in_a), (rows.joint_b, rows.in_b))
+        ]
 
     @property
     def is_constant(self) -> bool:

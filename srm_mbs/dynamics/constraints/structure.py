@@ -29,13 +29,13 @@ from srm_mbs.dynamics.constraints.projection import (
     unwhiten,
     whiten,
 )
-from srm_mbs.dynamics.constraints.rheonomic import unscaled_rows
+from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, unscaled_rows
 from srm_mbs.dynamics.constraints.row_algebra import RowAlgebra, row_algebra, trees
 from srm_mbs.dynamics.constraints.rows import Elimination, world_jacobian
 from srm_mbs.dynamics.scaling import Units, coordinate_units, row_units
 from srm_mbs.errors import EvaluationError, get_logger
 from srm_mbs.model.drives import in_order_of_rows
-from srm_mbs.model.mechanism import MechanismData, per_start
+from srm_mbs.model.mechanism import MechanismData, per_model, per_start
 from srm_mbs.model.validation import check_inertia
 
 log = get_logger(__name__)
@@ -619,3 +619,18 @@ def analyse(mechanism: MechanismData) -> Structure:
 def structure_of(mechanism: MechanismData) -> Structure:
     """The :func:`analyse` of ``mechanism``, made once."""
     return analyse(mechanism)
+
+
+@per_model
+def rows_in_use(mechanism: MechanismData) -> DrivenKinematics:
+    """The kept, scaled rows of closures and drives; only copies of their workspace are
+    evaluated."""
+    structure = structure_of(mechanism)
+    return DrivenKinematics(
+        mechanism.model,
+        mechanism.loops,
+        mechanism.drives,
+        structure.row_scale,
+        structure.kept,
+        structure.eliminations,
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import combinations, pairwise
 from typing import Any
 
@@ -24,6 +24,8 @@ MOST_PARTS = 2000
 """Points, bars and sliders of a linkage: the analysis of larger ones takes minutes."""
 SIZES = (1e-9, 1e9)
 """Sizes of a drawing (m), and lengths over the size; others are of another unit, or a mistake."""
+KEPT_NAMES = 64
+"""Linkages whose names are known to be good: variants of a linkage have the same."""
 COINCIDENT = 1e-9
 """Distance of two points, over the size of the drawing, at which they are the same."""
 
@@ -31,6 +33,30 @@ COINCIDENT = 1e-9
 def fault(element: str, problem: str, remedy: str) -> InputError:
     """The error about one element of the drawing."""
     return InputError(problem, element=element, remedy=remedy)
+
+
+@lru_cache(maxsize=KEPT_NAMES)
+def _check_names(points: tuple[str, ...], parts: tuple[tuple[str, str], ...]) -> None:
+    """Refuse names of points, and of parts with their kinds, that cannot be, and too many."""
+    known: set[str] = set()
+    for kind, name in (*(("point", name) for name in points), *parts):
+        element = f"{kind} {name!r}"
+        check_name(name, kind)
+        if not name or ":" in name:
+            raise fault(element, "a name has characters, and no colon", "Give another name")
+        if name in RESERVED:
+            raise fault(element, f"the name {name!r} is reserved", "Rename it")
+        if kind == "point":
+            continue
+        if name in known:
+            raise fault(element, "the name is used twice", "Give every part its own name")
+        known.add(name)
+    if len(points) + len(parts) > MOST_PARTS:
+        raise fault(
+            "planar",
+            f"the linkage has more than {MOST_PARTS} points, bars and sliders",
+            "Give fewer",
+        )
 
 
 class Drawing:
@@ -64,7 +90,8 @@ class Drawing:
         self.entry = entry
         self.unit = LENGTH_UNITS[entry.unit]
         self.angle = math.radians(1.0) if entry.angle == "deg" else 1.0
-        self.points = {name: self.unit * np.array(at) for name, at in entry.points.items()}
+        self._drawn = self.unit * np.array(list(entry.points.values()), dtype=float)
+        self.points: dict[str, FloatArray] = dict(zip(entry.points, self._drawn))
         self.ground = tuple(entry.ground)
         self._check_names()
         self.bars: dict[str, PlanarBar] = {bar.name: bar for bar in entry.bar}
@@ -84,27 +111,9 @@ class Drawing:
     # -- checks ------------------------------------------------------------------------------
 
     def _check_names(self) -> None:
-        known: set[str] = set()
         named = [("bar", bar.name) for bar in self.entry.bar]
         named += [("slider", slider.name) for slider in self.entry.slider]
-        for kind, name in (*(("point", name) for name in self.points), *named):
-            element = f"{kind} {name!r}"
-            check_name(name, kind)
-            if not name or ":" in name:
-                raise fault(element, "a name has characters, and no colon", "Give another name")
-            if name in RESERVED:
-                raise fault(element, f"the name {name!r} is reserved", "Rename it")
-            if kind == "point":
-                continue
-            if name in known:
-                raise fault(element, "the name is used twice", "Give every part its own name")
-            known.add(name)
-        if len(self.points) + len(named) > MOST_PARTS:
-            raise fault(
-                "planar",
-                f"the linkage has more than {MOST_PARTS} points, bars and sliders",
-                "Give fewer",
-            )
+        _check_names(tuple(self.points), tuple(named))
         if self.points and not SIZES[0] <= self.size <= SIZES[1]:
             raise fault(
                 "points", f"the drawing measures {self.size:g} m", "Correct the points, or the unit"
@@ -121,7 +130,7 @@ class Drawing:
     @cached_property
     def size(self) -> float:
         """Diagonal (m) of the drawing."""
-        return float(np.linalg.norm(np.ptp(np.array(list(self.points.values())), axis=0)))
+        return float(np.linalg.norm(np.ptp(self._drawn, axis=0)))
 
     def _check_ground(self) -> None:
         if not self.ground and all(slider.on for slider in self.entry.slider):
@@ -206,7 +215,7 @@ class Drawing:
     @cached_property
     def _places(self) -> dict[str, tuple[float, float]]:
         """The points as plain numbers."""
-        return {name: (float(x), float(y)) for name, (x, y) in self.points.items()}
+        return {name: (x, y) for name, (x, y) in zip(self.points, self._drawn.tolist())}
 
     def _apart(self, a: str, b: str) -> float:
         """Distance (m) of two points as drawn."""
@@ -215,6 +224,11 @@ class Drawing:
     def carriers(self, point: str) -> list[str]:
         """The bodies that have a point: the ground, bars, and sliders with mass."""
         return list(self._carriers[point])
+
+    @property
+    def carried(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
+        """All points, and the bodies that have each."""
+        return tuple((point, tuple(bodies)) for point, bodies in self._carriers.items())
 
     @cached_property
     def _carriers(self) -> dict[str, list[str]]:

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -87,16 +87,64 @@ def translate(document: Document, options: Options) -> Translation:
         return _Linkage(options.planar, options).translation()
 
 
+class _Connections(NamedTuple):
+    """How the bodies of a linkage are joined: the same for all its variants.
+
+    Attributes
+    ----------
+    loose
+        The first bodies that are not connected with the ground; without any, the rest follows.
+    hubs
+        The body nearest to the ground at each point, which the others there are joined with.
+    joints
+        Name, type, parent, child and point of all joints.
+    """
+
+    loose: tuple[str, ...]
+    hubs: Mapping[str, str]
+    joints: tuple[tuple[str, str, str, str, str], ...]
+
+
 @lru_cache(maxsize=KEPT_GRAPHS)
-def _levels(
-    bodies: tuple[str, ...], links: tuple[tuple[str, str], ...]
-) -> tuple[Mapping[str, int], tuple[str, ...]]:
-    """Number of links between the ground and each body, and the first bodies that are not connected
-    with it, if there are any."""
+def _connections(
+    bodies: tuple[str, ...],
+    carriers: tuple[tuple[str, tuple[str, ...]], ...],
+    sliders: tuple[tuple[str, str, str, bool], ...],
+) -> _Connections:
+    """The connections of ``bodies``, the ground first.
+
+    Parameters
+    ----------
+    carriers
+        Points, and the bodies that have each.
+    sliders
+        Name, point, the body on which it slides, and whether it has mass.
+    """
+    at = dict(carriers)
+    links = [(there[0], other) for there in at.values() for other in there[1:]]
+    links += [(on, body) for _, point, on, _ in sliders for body in at[point]]
     named = [Joint(str(k), "revolute", a, b) for k, (a, b) in enumerate(links)]
     parts = components({name: Body(name) for name in bodies}, named)
     loose = next((tuple(part) for part in parts if WORLD not in part), ())
-    return MappingProxyType({} if loose else distances(named, WORLD)), loose
+    if loose:
+        return _Connections(loose, {}, ())
+    depths = distances(named, WORLD)
+    hubs = {
+        point: min(there, key=lambda body: (depths[body], bodies.index(body)))
+        for point, there in carriers
+        if there
+    }
+    joints = []
+    # Slides first: of joints that could be cut equally well, they stay in the tree.
+    for name, point, on, massive in sliders:
+        kind, child = ("prismatic", name) if massive else ("slot", hubs[point])
+        joints.append((name, kind, on, child, point))
+    for point, there in carriers:
+        for body in there:
+            if body != hubs[point]:
+                name = point if len(there) == 2 else f"{point}:{body}"
+                joints.append((name, "revolute", hubs[point], body, point))
+    return _Connections((), MappingProxyType(hubs), tuple(joints))
 
 
 @lru_cache(maxsize=KEPT_GRAPHS)
@@ -119,9 +167,9 @@ class _Linkage:
         self.drawing = Drawing(entry)
         self.bodies: list[str] = list(self.drawing.bodies)
         self.slots: list[PlanarSlider] = [each for each in entry.slider if not each.mass]
-        self.points_of_joints: dict[str, str] = {}
+        self.connections = self._connected()
+        self.points_of_joints = {name: point for name, *_, point in self.connections.joints}
         """The point of each joint."""
-        self.depths = self._depths()
         self.joints = self._tree()
         for joint in self.joints:
             if joint.type == "revolute" and joint.child in self.drawing.bars:
@@ -131,23 +179,20 @@ class _Linkage:
             for joint in self.joints
         }
         """Of the links, in the axes of :meth:`Drawing.on_body`."""
+        self._local_places: dict[tuple[str, str], FloatArray] = {}
+        """Results of :meth:`_local`."""
 
     # -- the graph ---------------------------------------------------------------------------
 
-    def _depths(self) -> Mapping[str, int]:
-        """Number of joints between the ground and each body."""
-        links = [
-            (a, b)
-            for point in self.drawing.points
-            for a in self.drawing.carriers(point)[:1]
-            for b in self.drawing.carriers(point)[1:]
-        ]
-        links += [
-            (slider.on or WORLD, name)
-            for slider in self.entry.slider
-            for name in self.drawing.carriers(slider.point)
-        ]
-        depths, first = _levels(tuple(self.bodies), tuple(links))
+    def _connected(self) -> _Connections:
+        """How its bodies are joined, all with the ground."""
+        drawing = self.drawing
+        found = _connections(
+            drawing.bodies,
+            drawing.carried,
+            tuple((s.name, s.point, s.on or WORLD, bool(s.mass)) for s in self.entry.slider),
+        )
+        first = found.loose
         if first:
             one = len(first) == 1
             raise fault(
@@ -157,35 +202,7 @@ class _Linkage:
                 else "nothing connects them with the ground",
                 "Give it a point of another bar, or one of its points to ground",
             )
-        return depths
-
-    def _hub(self, bodies: list[str]) -> str:
-        """The body nearest to the ground, which the others at a pin are joined with."""
-        return min(bodies, key=lambda body: (self.depths[body], self.bodies.index(body)))
-
-    def _graph(self) -> Iterator[tuple[str, str, str, str]]:
-        """Name, type, parent and child of all joints.
-
-        Slides first: of joints that could be cut equally well, they stay in the tree.
-        """
-        drawing = self.drawing
-        for slider in self.entry.slider:
-            if slider.mass:
-                yield slider.name, "prismatic", slider.on or WORLD, slider.name
-            else:
-                others = drawing.carriers(slider.point)
-                yield slider.name, "slot", slider.on or WORLD, self._hub(others)
-            self.points_of_joints[slider.name] = slider.point
-        for point in drawing.points:
-            bodies = drawing.carriers(point)
-            if len(bodies) < 2:
-                continue
-            hub = self._hub(bodies)
-            for body in bodies:
-                if body != hub:
-                    name = point if len(bodies) == 2 else f"{point}:{body}"
-                    self.points_of_joints[name] = point
-                    yield name, "revolute", hub, body
+        return found
 
     @cached_property
     def _acted_on(self) -> dict[str, str]:
@@ -206,17 +223,17 @@ class _Linkage:
         return known | found
 
     def _tree(self) -> list[Joint]:
-        graph = list(self._graph())
+        graph = self.connections.joints
         names = [name for name, *_ in graph]
-        for name in names:
-            if names.count(name) > 1:
-                raise fault(
-                    f"slider {name!r}", "a pin has the same name", "Give one of them another name"
-                )
+        if len(self.points_of_joints) < len(names):
+            name = next(name for name in names if names.count(name) > 1)
+            raise fault(
+                f"slider {name!r}", "a pin has the same name", "Give one of them another name"
+            )
         for name, where in self._acted_on.items():
             if where and name not in names:
                 raise fault(where, f"there is no pin or slider {name!r}", known_names(names))
-        kept = tuple((*joint, joint[0] in self._acted_on) for joint in graph)
+        kept = tuple((*joint[:4], joint[0] in self._acted_on) for joint in graph)
         tree = _spanned(kept, tuple(self.options.cut))
         for joint in tree.cut:
             if joint.name in self._acted_on:
@@ -256,8 +273,12 @@ class _Linkage:
 
     def _local(self, body: str, point: str) -> FloatArray:
         """A point (2,) in the frame of the link of a body."""
-        drawing = self.drawing
-        return drawing.on_body(body, drawing.points[point], point) - self.origins[body]
+        key = body, point
+        if key not in self._local_places:
+            drawing = self.drawing
+            at = drawing.on_body(body, drawing.points[point], point)
+            self._local_places[key] = at - self.origins[body]
+        return self._local_places[key]
 
     def _at(self, body: str, point: str) -> pin.SE3:
         return pin.SE3(np.eye(3), in_space(self._local(body, point)))
@@ -274,7 +295,7 @@ class _Linkage:
         bodies = self.drawing.carriers(point)
         if not bodies:
             raise fault(element, f"point {point!r} is on no bar", "Give it to a bar, or to ground")
-        return self._hub(bodies)
+        return self.connections.hubs[point]
 
     def _line(self, slider: PlanarSlider, normal: bool = False) -> tuple[float, float, float]:
         """Direction of the line of a slider, or its normal, in the body on which it slides."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -24,6 +25,8 @@ FIT_ITERATIONS = 100
 """Newton steps after which lengths are taken for impossible."""
 DIVERGED = 1e12
 """Coordinates over the largest of the lengths at which Newton's method has failed."""
+KEPT_SHAPES = 1024
+"""Bars whose slender bodies are kept: variants of a linkage have most of them in common."""
 COLLINEAR = 1e-12
 """Distance of points from a line, over the size of the bar, that is rounding."""
 PALETTE = (
@@ -58,7 +61,10 @@ def direction_angle(vector: FloatArray) -> float:
 def own_axes(points: FloatArray) -> FloatArray:
     """Points (n, 2) in axes that begin at the first of them, with x towards the second."""
     angle = direction_angle(points[1] - points[0])
-    out = np.array([turned(point - points[0], -angle) for point in points])
+    # With plain numbers, because NumPy takes ten times as long for so few.
+    c, s = float(np.cos(-angle)), float(np.sin(-angle))
+    along = (points - points[0]).tolist()
+    out = np.array([[c * x - s * y, s * x + c * y] for x, y in along])
     out[np.abs(out) < COLLINEAR * np.abs(out).max()] = 0.0
     return out
 
@@ -147,9 +153,16 @@ class Slender:
 
 
 def slender(points: FloatArray) -> Slender:
-    """The slender bars along the :func:`outline` of points (n, 2)."""
-    # With plain numbers, because NumPy takes ten times as long for so few.
-    at = points.tolist()
+    """The slender bars along the :func:`outline` of points (n, 2); nothing may change the result,
+    which is the same object for the same points."""
+    return _slender(points.shape, points.tobytes())
+
+
+@lru_cache(maxsize=KEPT_SHAPES)
+def _slender(shape: tuple[int, ...], numbers: bytes) -> Slender:
+    """:func:`slender` from the bytes of the points, which tell signs of zeros apart."""
+    points = np.frombuffer(numbers).reshape(shape)
+    at = points.tolist()  # plain numbers, as in own_axes
     if len(at) == 2:
         (a, b), (c, d) = at
         p, q = c - a, d - b
@@ -160,9 +173,10 @@ def slender(points: FloatArray) -> Slender:
     parts = [math.hypot(c - a, d - b) for a, b, c, d in ends]
     length = math.fsum(parts)
     weights = [part / length for part in parts]
-    x = sum(0.5 * w * (a + c) for w, (a, _, c, _) in zip(weights, ends))
-    y = sum(0.5 * w * (b + d) for w, (_, b, _, d) in zip(weights, ends))
-    xx = xy = yy = 0.0
+    x = y = xx = xy = yy = 0.0
+    for w, (a, b, c, d) in zip(weights, ends):
+        x += 0.5 * w * (a + c)
+        y += 0.5 * w * (b + d)
     for w, (a, b, c, d) in zip(weights, ends):
         p, q, u, v = c - a, d - b, 0.5 * (a + c) - x, 0.5 * (b + d) - y
         xx += w * (p * p / 12.0 + u * u)

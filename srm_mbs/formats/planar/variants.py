@@ -8,6 +8,7 @@ would compute them; texts, the check of the XML and Pinocchio's reader are left 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,9 @@ from srm_mbs.formats.graph.spanning_tree_to_urdf import is_identity
 from srm_mbs.formats.translation import KnownTree
 from srm_mbs.formats.urdf.validation import doubtful_moments
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
+
+KEPT_BODIES = 1024
+"""Inertias that are kept: variants of a linkage have most of them in common."""
 
 
 def shape_of(bodies: Sequence[Body], joints: Sequence[Joint]) -> tuple[Any, ...]:
@@ -73,12 +77,20 @@ def model_of_variant(
         inertia = inertias[joint.child]
         if inertia is None:
             continue
-        mass, lever = inertia.mass, inertia.lever
-        if is_identity(pin.SE3(np.eye(3), lever)):
-            lever = np.zeros(3)
-        # Rounded as by Pinocchio's reader, which adds the body twice to one without mass.
-        one = mass * (1.0 / (mass or 1.0))
-        body = pin.Inertia(mass, one * (one * (lever + 0.0)), np.zeros((3, 3)))
-        body.inertia = inertia.inertia + 0.0
-        model.inertias[number] = pin.SE3.Identity().act(body)
+        model.inertias[number] = _as_read(
+            inertia.mass, inertia.lever.tobytes(), inertia.inertia.tobytes()
+        )
     return model
+
+
+@lru_cache(maxsize=KEPT_BODIES)
+def _as_read(mass: float, lever_numbers: bytes, tensor_numbers: bytes) -> pin.Inertia:
+    """An inertia as Pinocchio's reader of URDF rounds it; nothing may change it."""
+    lever, tensor = np.frombuffer(lever_numbers), np.frombuffer(tensor_numbers)
+    if is_identity(pin.SE3(np.eye(3), lever)):
+        lever = np.zeros(3)
+    # The reader adds the body twice to one without mass.
+    one = mass * (1.0 / (mass or 1.0))
+    body = pin.Inertia(mass, one * (one * (lever + 0.0)), np.zeros((3, 3)))
+    body.inertia = tensor.reshape((3, 3)) + 0.0
+    return pin.SE3.Identity().act(body)

@@ -235,7 +235,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
-    print(f"{os.cpu_count()} cores, load {load}; backend {srm.backend()}\n")
+    backend = arguments.backend if arguments.variants else srm.backend()
+    print(f"{os.cpu_count()} cores, load {load}; backend {backend}\n")
     print("| run (s) | executor | workers | chunk | cases | runs/s | of serial | CPU / wall |")
     print("|---|---|---|---|---|---|---|---|")
     rows = []

@@ -168,14 +168,20 @@ rtol = 1e-8
 """Start and run of the six-bars."""
 
 
-def watt_six_bar() -> tuple[str, str]:
-    """Watt's chain with a binary ground: two ternary links that meet in a pin."""
+def watt_points() -> dict[str, Vector]:
+    """The pins of Watt's six-bar in its pose, A and D on the ground."""
     a, d = vector(0.0, 0.0), vector(1.0, 0.0)
     b = a + 0.3 * vector(np.cos(1.0), np.sin(1.0))
     c = meeting(b, 0.9, d, 0.7, left=True)
     e = meeting(b, 0.75, c, 0.6, left=True)
     f = meeting(d, 1.2, c, 0.6, left=False)
     g = meeting(e, 0.9, f, 0.8, left=True)
+    return {"A": a, "B": b, "C": c, "D": d, "E": e, "F": f, "G": g}
+
+
+def watt_six_bar() -> tuple[str, str]:
+    """Watt's chain with a binary ground: two ternary links that meet in a pin."""
+    a, b, c, d, e, f, g = watt_points().values()
     plane = Linkage(
         "watt_six_bar",
         "Watt's six-bar: a crank, two ternary links that meet in a pin, and a dyad between them.",
@@ -202,12 +208,6 @@ def watt_six_bar() -> tuple[str, str]:
 
 def watt_six_bar_planar() -> tuple[str, str]:
     """:func:`watt_six_bar` typed in as points and bars."""
-    a, d = vector(0.0, 0.0), vector(1.0, 0.0)
-    b = a + 0.3 * vector(np.cos(1.0), np.sin(1.0))
-    c = meeting(b, 0.9, d, 0.7, left=True)
-    e = meeting(b, 0.75, c, 0.6, left=True)
-    f = meeting(d, 1.2, c, 0.6, left=False)
-    g = meeting(e, 0.9, f, 0.8, left=True)
     plane = Drawing(
         "watt_six_bar_planar",
         "The bundled watt_six_bar typed in as points and bars. The angle of the crank counts from "
@@ -215,7 +215,7 @@ def watt_six_bar_planar() -> tuple[str, str]:
         0.035,
         ("A", "D"),
         "{ A = 8.0 }",
-        {"A": a, "B": b, "C": c, "D": d, "E": e, "F": f, "G": g},
+        watt_points(),
         {
             "crank": ("A", "B"),
             "coupler": ("B", "C", "E"),

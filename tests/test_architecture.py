@@ -101,6 +101,19 @@ def test_integration_asks_the_protocol_of_systems_not_their_classes(module: str)
             assert not re.search(r"System\b", ast.unparse(node.args[1])), ast.unparse(node)
 
 
+@pytest.mark.parametrize("module", MODULES)
+def test_nothing_is_written_past_the_attributes_of_an_object(module: str) -> None:
+    """Frozen dataclasses would be changed without notice."""
+    for node in ast.walk(syntax_tree(module)):
+        written: list[ast.expr] = []
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            written = [node.func.value] if node.func.attr in ("update", "setdefault", "pop") else []
+        elif isinstance(node, ast.Assign):
+            written = [to.value for to in node.targets if isinstance(to, ast.Subscript)]
+        for target in written:
+            assert not re.search(r"__dict__$|^vars\(", ast.unparse(target)), ast.unparse(node)
+
+
 def loaded_by(statement: str) -> set[str]:
     code = f"import sys\n{statement}\nprint(*sorted(sys.modules), sep='\\n')"
     run = subprocess.run(

@@ -392,11 +392,10 @@ class LoopClosure:
 
     def between(self, a: Anchor, b: Anchor) -> LoopClosure:
         """The same closure between other places."""
-        out = object.__new__(type(self))  # all else has been checked
-        own = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        out.__dict__.update(own, a=a, b=b)
+        out = replace(self, a=a, b=b)
         if self.type != "distance" or self.length is not None:
-            out.__dict__["rows"] = self.rows  # in the axes of the anchors, wherever these are
+            # In the axes of the anchors, wherever these are.
+            object.__setattr__(out, "rows", self.rows)
         return out
 
     @property

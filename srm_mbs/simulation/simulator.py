@@ -385,7 +385,8 @@ class Simulator:
     def clone(self) -> Simulator:
         """An independent copy, which continues identically; its statistics start at 0."""
         other = Simulator.__new__(Simulator)
-        other.__dict__.update(self.__dict__)
+        for name, value in vars(self).items():
+            setattr(other, name, value)
         other._make()
         other._forces.extend(self._forces)
         other._last_dt, other._busy = self._last_dt, self._busy

@@ -125,12 +125,6 @@ class Joint:
     armature: float = 0.0
     coupled: bool = False
 
-    def placed(self, in_parent: pin.SE3, axis: Direction) -> Joint:
-        """The same joint elsewhere in its parent, about or along another axis."""
-        out = object.__new__(Joint)  # a tenth of the time of dataclasses.replace
-        out.__dict__.update(self.__dict__, in_parent=in_parent, axis=axis)
-        return out
-
     @property
     def kept(self) -> bool:
         """Whether a closure could not replace it."""

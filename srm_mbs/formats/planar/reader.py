@@ -361,11 +361,11 @@ class _Linkage:
         """A joint of the tree with its frame on the parent; that on the child is the link's."""
         place = self._at(joint.parent, self._point(joint))
         if joint.type == "revolute":
-            return joint.placed(place, HINGE_AXIS)
+            return replace(joint, in_parent=place, axis=HINGE_AXIS)
         slider = self.drawing.sliders[joint.name]
         x, y, z = self._line(slider)
         axis = (x, y, z) if joint.child == slider.name else (-x, y, -z)
-        return joint.placed(place, axis)
+        return replace(joint, in_parent=place, axis=axis)
 
     def _inertia(self, body: str) -> pin.Inertia | None:
         drawing = self.drawing

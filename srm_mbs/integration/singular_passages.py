@@ -723,11 +723,12 @@ def _crossing_at(
     kind = "passed"
     if not certain and monitor.avoids(time):
         kind = "avoided"
-    else:
+    # A motion that reaches a singular configuration passes or touches it: both are listed.
+    elif not value <= TOUCHING_VALUE * scale:
         cosine = _rank_loss_cosine(monitor, time, certain, before, after)
         if cosine is None:
             return None
-        if cosine > TURNED_BACK_COSINE and value > TOUCHING_VALUE * scale:
+        if cosine > TURNED_BACK_COSINE:
             time, value = monitor.minimum(times[near], values[near], power=1)
             if value > TOUCHING_VALUE * scale:
                 return None

@@ -567,6 +567,11 @@ def _crossings_along_curves(monitor: ConstraintMonitor, steps: StepData) -> list
         time = float(steps.times[lowest + 1])
         critical = monitor.critical(time)
         if critical is None:
+            # The steps around it may have their ends too far from it to lead there.
+            around = steps.times[[lowest, min(lowest + 2, steps.count)]]
+            time = _closest(monitor, np.linspace(*around, SAMPLES))
+            critical = monitor.critical(time)
+        if critical is None:
             continue
         beside = 0.25 * float(steps.times[last] - steps.times[first])
         kind = "avoided" if monitor.follows(critical) else "passed"

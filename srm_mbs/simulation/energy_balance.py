@@ -186,8 +186,7 @@ def _smooth(system: _System) -> bool:
     """Whether dampers do all the work, and no force has a kink."""
     mechanism = system.mechanism
     return not (system.controlled or mechanism.drives or np.any(mechanism.model.friction)) and all(
-        isinstance(force, LINEAR) and not getattr(force, "slack", 0.0)
-        for force in mechanism.forces
+        isinstance(force, LINEAR) and not getattr(force, "slack", 0.0) for force in mechanism.forces
     )
 
 

@@ -301,7 +301,7 @@ class SimulationResult(RunOutcome):
 
     @property
     def backend(self) -> str:
-        """What made the run: ``settings.backend``, without the rest of the settings."""
+        """Backend of the run: ``settings.backend``, without the rest of the settings."""
         known = self.__dict__.get("settings")
         return self._run.backend if known is None else known.backend
 

@@ -568,8 +568,8 @@ def _crossings_along_curves(monitor: ConstraintMonitor, steps: StepData) -> list
         critical = monitor.critical(time)
         if critical is None:
             # The steps around it may have their ends too far from it to lead there.
-            around = steps.times[[lowest, min(lowest + 2, steps.count)]]
-            time = _closest(monitor, np.linspace(*around, SAMPLES))
+            before, after = steps.times[lowest], steps.times[min(lowest + 2, steps.count)]
+            time = _closest(monitor, np.linspace(before, after, SAMPLES))
             critical = monitor.critical(time)
         if critical is None:
             continue

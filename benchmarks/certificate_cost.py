@@ -3,9 +3,9 @@
     python -m benchmarks.certificate_cost [--models NAME ...] [--seconds 10] [--repeats 5]
 
 Run from a checkout with the compiled kernel; BLAS runs on one thread.  CPU times of the process in
-milliseconds, the least of the repeats, each on a fresh run: other programs only add to them.  ``certify`` is without its two reruns,
-and includes the passages and the balance where it reads them.  ``n_four_bar_N`` is
-``srm.n_four_bar(N)``.
+milliseconds, the least of the repeats, each on a fresh run: other programs only add to them.
+``certify`` is without its two reruns, and includes the passages and the balance where it reads
+them.  ``n_four_bar_N`` is ``srm.n_four_bar(N)``.
 """
 
 from __future__ import annotations

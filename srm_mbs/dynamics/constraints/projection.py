@@ -67,6 +67,7 @@ def whiten(U: FloatArray, right: FloatArray) -> FloatArray:
 
 def _whiten_in_place(U: FloatArray, right: FloatArray) -> None:
     """As :func:`whiten`, for ``right`` (n, k) in Fortran's order, which it replaces."""
+    # No unit diagonal, the leading dimension of U, and leave to overwrite.
     lapack.dtrtrs(U, right, _UPPER, _TRANSPOSED, 0, len(U), 1)
 
 

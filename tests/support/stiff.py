@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
-from tests.support.reduced import OneDegree
+from tests.support.reduced import OneDegree, regular_slider_crank
 
 RATE = 5.0
 """Stiffness over damping of the bushing (1/s)."""
@@ -197,6 +197,44 @@ def by_turns(
         t, state = end, run.y[:, -1]
         signs = np.where(np.abs(equation.rates(*state)) < 1e-7, -signs, signs)
     return np.concatenate([rows for rows in found if len(rows)])
+
+
+def rubbing_slider_crank(friction: float, start: FloatArray, times: FloatArray) -> FloatArray:
+    """Angles (k,) of the crank of slider_crank_regular at ``times`` (k,) s from its angle and rate
+    ``start``, with dry ``friction`` (N m) in both joints: from one turn to the next it is constant.
+
+    The rod turns against the crank by (d beta / d theta - 1) < 0 times the rate of the crank, so
+    that both joints turn back at the same time.
+    """
+
+    def field(t: float, y: FloatArray) -> Any:
+        s, c = np.sin(y[0]), np.cos(y[0])
+        ratio = -c / (3.0 * np.sqrt(1.0 - s * s / 9.0)) - 1.0
+        return regular_slider_crank(lambda rate: -direction * friction * (1.0 - ratio))(t, y)
+
+    def turn(t: float, y: FloatArray) -> float:
+        return float(direction * y[1])
+
+    turn.terminal, turn.direction = True, -1.0  # type: ignore[attr-defined]
+    t, state, direction, found = 0.0, start, float(np.sign(start[1])), []
+    while t < times[-1]:
+        run = solve_ivp(
+            field,
+            (t, times[-1]),
+            state,
+            "DOP853",
+            times[(times > t)],
+            rtol=1e-12,
+            atol=1e-12,
+            events=turn,
+        )
+        assert run.success
+        found.append(run.y[0])
+        if run.status == 1:
+            t, state, direction = run.t_events[0][0], run.y_events[0][0] * [1.0, 0.0], -direction
+        else:
+            t = times[-1]
+    return np.concatenate(found)
 
 
 def follower(rate: float) -> tuple[srm.Mechanism, Callable[..., FloatArray]]:

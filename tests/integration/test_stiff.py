@@ -23,6 +23,8 @@ from tests.support.convergence import fitted_order, observed_order, turning
 from tests.support.mechanisms import floating_ring
 from tests.support.reduced import regular_slider_crank, slider_crank
 from tests.support.stiff import (
+    braced_four_bar,
+    braced_reference,
     bushed_four_bar,
     bushed_reference,
     by_radau,
@@ -277,6 +279,21 @@ def test_the_cost_does_not_grow_with_forces_that_closures_take_up(backend: str) 
     assert max(steps) < 1.6 * min(steps)
     # The limit of infinite damping is met to the order of the time constant.
     np.testing.assert_allclose(ends[1], ends[2], rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.stress
+def test_a_bushing_without_leverage_vibrates_as_its_reduced_equation_does() -> None:
+    """Overdamped at first, and from the dead point of its damping on a vibration of 134 rad/s."""
+    tau = 1e-4
+    mechanism, times = braced_four_bar(tau), np.linspace(0.05, 0.6, 12)
+    expected = braced_reference(mechanism, tau, times)
+    for rtol in (1e-4, 1e-6):
+        run = srm.simulate(mechanism, times[-1], rtol=rtol)
+        q, v = run(times)
+        np.testing.assert_allclose(q[:, 0], expected[:, 0], rtol=0.0, atol=10.0 * rtol)
+        np.testing.assert_allclose(v[:, 0], expected[:, 1], rtol=0.0, atol=50.0 * rtol)
+    ((start, end),) = run.settings.stiff
+    assert start < 0.1 < end < times[-1]
 
 
 # Singular configurations, drives, friction that turns

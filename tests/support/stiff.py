@@ -51,10 +51,48 @@ def guided_four_bar(tau: float) -> srm.Mechanism:
     return replace(srm.load("four_bar"), forces=(bushing,))
 
 
+BETWEEN = (0.0, 0.0, 0.0), (0.75, 0.0, 0.0)
+"""Points of the coupler and of the rocker whose distance changes as the four-bar moves."""
+
+
+def braced_four_bar(tau: float) -> srm.Mechanism:
+    """The four-bar with a bushing between two points of coupler and rocker that damps 1 kg /
+    ``tau`` (s): it pulls them to their least distance, where it has no leverage to damp."""
+    c = 1.0 / tau
+    planar = np.array([1.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    brace = srm.Bushing(
+        a=srm.Anchor("coupler", xyz=BETWEEN[0]),
+        b=srm.Anchor("rocker", xyz=BETWEEN[1]),
+        stiffness=tuple(RATE * c * planar),
+        damping=tuple(c * planar),
+        name="brace",
+    )
+    return replace(srm.load("four_bar"), forces=(brace,))
+
+
+def braced_reference(mechanism: srm.Mechanism, tau: float, times: FloatArray) -> FloatArray:
+    """Angles and rates (k, 2) of its crank at ``times`` (k,) s, by LSODA on its equation of one
+    degree of freedom."""
+    equation = OneDegree(replace(mechanism, forces=()), "crank")
+    forces = bushed_forces(mechanism, tau, *BETWEEN)
+
+    def field(t: float, y: FloatArray) -> list[float]:
+        v = equation.rates(*y)
+        equation.force = forces(equation.q, v)
+        return equation(t, y)
+
+    start = [mechanism.q0[0], mechanism.v0[0]]
+    run = solve_ivp(field, (0.0, times[-1]), start, "LSODA", times, rtol=1e-9, atol=1e-10)
+    assert run.success
+    states: FloatArray = run.y.T
+    return states
+
+
 def bushed_forces(
-    mechanism: srm.Mechanism, tau: float
+    mechanism: srm.Mechanism, tau: float, a: Any = A, b: Any = B
 ) -> Callable[[FloatArray, FloatArray], FloatArray]:
-    """Its generalised forces of the bushing at (q, v), the force in the rocker's axes by hand."""
+    """Its generalised forces at (q, v) of a bushing between the points ``a`` of the coupler and
+    ``b`` of the rocker, the force in the rocker's axes by hand."""
     model = mechanism.model
     data = model.createData()
     frames = [model.getFrameId(name, pin.FrameType.BODY) for name in ("coupler", "rocker")]
@@ -64,7 +102,7 @@ def bushed_forces(
         pin.computeJointJacobians(model, data, q)
         pin.updateFramePlacements(model, data)
         points, jacobians = [], []
-        for frame, at in zip(frames, (A, B)):
+        for frame, at in zip(frames, (a, b)):
             J = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)
             arm = data.oMf[frame].rotation @ np.array(at)
             points.append(data.oMf[frame].translation + arm)

@@ -41,6 +41,7 @@ from srm_mbs.integration.methods.stiffness import (
     count_stiffness,
     reversal_error,
     stiffness_of,
+    stopping_tolerance,
 )
 
 RESIDUAL_EVERY = 16
@@ -280,6 +281,8 @@ class SplitStep:
             ends = np.array([memory.rate, result.end_rate])
             unseen = reversal_error(h, ends[:, :k], ends[:, k:], sums, system.friction_speed)
             error[k:] = np.maximum(np.abs(error[k:]), unseen)
+            rubbing = k + np.flatnonzero(sums.any(axis=0))
+            weights[rubbing] = np.minimum(weights, stopping_tolerance(norm))[rubbing]
         if scheme.implicit is not None:
             weights = np.minimum(weights, system.friction_tolerance(result.end_rate[:k]))
         if branch is not None and history is not None:

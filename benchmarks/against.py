@@ -12,7 +12,8 @@ checkout.
     runs        P1 and P2 of ``benchmarks.work_precision``, with output at 100 times (ms), each at
                 the rtol whose error is the one given
     loops       N-four-bars: an evaluation, mean over 8 states of a run, and the run itself, 1.2 s
-                through the first passage at rtol 1e-8
+                through the first passage at rtol 1e-8; and the evaluation without generated code,
+                which has its limit between 160 and 320 loops
     compile     CPU seconds of ``srm.compile`` into an empty cache, and of loading; here only
 """
 
@@ -64,7 +65,6 @@ except ImportError:  # before generated code
     make_kernel_system = lambda system, code: twin_of(system)
 
 generates = hasattr(srm, "compile")
-backend = {"backend": "generated"} if generates else {}
 mechanisms = {}
 
 def least(call, seconds=0.03, batches=3):
@@ -86,8 +86,15 @@ def loaded(name):
         mechanisms[name].structure
     return mechanisms[name]
 
-def kernel_system(mechanism):
-    return make_kernel_system(make_system(mechanism), load_code(mechanism))
+def code(mechanism, by):
+    """Its generated code, if there can be any and ``by`` does not ask for the kernel."""
+    try:
+        return load_code(mechanism) if by != "kernel" else None
+    except srm.InputError:
+        return None
+
+def kernel_system(mechanism, by="generated"):
+    return make_kernel_system(make_system(mechanism), code(mechanism, by))
 
 def evaluation(name):
     mechanism = loaded(name)
@@ -95,8 +102,10 @@ def evaluation(name):
     system = kernel_system(mechanism)
     return least(lambda: system.repeat(0.0, state, 50)) / 50
 
-def run(name, t_end, rtol, samples):
+def run(name, t_end, rtol, samples, by="generated"):
     mechanism = loaded(name)
+    by = "generated" if code(mechanism, by) else "kernel"
+    backend = {"backend": by} if generates else {}
     times = np.linspace(0.0, t_end, samples + 1)[1:]
     def call():
         solution = srm.simulate(mechanism, t_end, rtol=rtol, **backend)
@@ -105,11 +114,11 @@ def run(name, t_end, rtol, samples):
     call()
     return least(call)
 
-def mean(name):
+def mean(name, by="generated"):
     mechanism = loaded(name)
     states = srm.simulate(mechanism, 1.2, rtol=1e-8).steps.states
     chosen = states[np.linspace(0, len(states) - 1, 8).astype(int)]
-    system = kernel_system(mechanism)
+    system = kernel_system(mechanism, by)
     return float(np.mean([least(lambda: system.repeat(0.0, s, 5), 0.01) for s in chosen])) / 5
 
 def compilation(name, again):
@@ -156,14 +165,15 @@ class Interpreter:
         self._process.communicate()
 
 
-def compare(title: str, other: Interpreter, here: Interpreter, rounds: int, *case: Any) -> None:
-    """Print the times of a case in both, and their ratio."""
+def compare(title: str, other: Interpreter, here: Interpreter, rounds: int, *case: Any) -> float:
+    """Print the times of a case in both, and their ratio; the time here."""
     theirs, ours = [], []
     for _ in range(rounds):
         theirs.append(other.measure(*case) or float("nan"))
         ours.append(here.measure(*case) or float("nan"))
     ratio = statistics.median(a / b for a, b in zip(theirs, ours))
     print(f"{title:44s} {1e6 * min(theirs):12.3f} {1e6 * min(ours):12.3f} {ratio:8.2f}", flush=True)
+    return min(ours)
 
 
 def compile_times(python: str, names: tuple[str, ...]) -> None:
@@ -198,9 +208,14 @@ def main() -> None:
                 title = f"run, {name}, error {error:g}, rtol {rtol:g}"
                 compare(title, other, here, rounds, "run", name, 10.0, rtol, 100)
         if "loops" in arguments.cases:
+            of_kernel = []
             for n in arguments.loops:
                 compare(f"evaluation, {n} loops", other, here, rounds, "mean", n)
                 compare(f"run, {n} loops", other, here, rounds, "run", n, 1.2, 1e-8, 0)
+                title = f"evaluation, {n} loops, without generated code"
+                of_kernel.append(compare(title, other, here, rounds, "mean", n, "kernel"))
+            growth = of_kernel[-1] / of_kernel[0]
+            print(f"growth of the last from {arguments.loops[0]} loops on: {growth:.1f}")
         other.close()
         here.close()
     if "compile" in arguments.cases:

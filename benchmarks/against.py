@@ -151,11 +151,8 @@ class Interpreter:
 
     def measure(self, *case: Any) -> float | None:
         """Seconds of a case; None where this revision has no such thing."""
-        source, sink = self._process.stdin, self._process.stdout
-        assert source is not None and sink is not None
-        source.write(json.dumps(case) + "\n")
-        source.flush()
-        answer = sink.readline()
+        print(json.dumps(case), file=self._process.stdin, flush=True)
+        answer = "" if self._process.stdout is None else self._process.stdout.readline()
         if not answer:
             raise SystemExit(f"the measurement of {case} failed")
         return json.loads(answer)  # type: ignore[no-any-return]

@@ -401,12 +401,15 @@ def assemble_positions(problem: ClosureProblem, start: FloatArray, free: IndexAr
     """The closed configuration nearest to the guess ``start``, or the closest one to closed."""
     if not len(free):
         return start
-    rng = np.random.default_rng(0)
     together = len(problem.groups) == 1
+    rng: np.random.Generator | None = None  # most starts need none, and making one takes 20 us
 
     best, best_gap = start, float(np.linalg.norm(problem.mismatch(start)))
     for size in (0.0, *PERTURBATIONS):
-        spread = rng.uniform(-size, size, len(free)) if size else np.zeros(len(free))
+        spread = np.zeros(len(free))
+        if size:
+            rng = rng or np.random.default_rng(0)
+            spread = rng.uniform(-size, size, len(free))
         steps = RESTART_STEPS if size else SEARCH_STEPS if together else STEPS_TOGETHER
         q = close_positions(problem, problem.move(start, spread, free), free, steps)
         if problem.closed(q):
@@ -423,6 +426,7 @@ def assemble_positions(problem: ClosureProblem, start: FloatArray, free: IndexAr
     far = float(np.abs(away).max())
     if far > FAR:
         # Another branch may be nearer: look on the other side of the guess and around it.
+        rng = rng or np.random.default_rng(0)
         others = [-0.5 * away, -away]
         others += list(rng.uniform(-far, far, (OTHER_STARTS, len(free))))
         for other in others:

@@ -22,6 +22,7 @@ The fields of :class:`LoopClosure` are the one list of the keys of a closure: de
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -392,10 +393,11 @@ class LoopClosure:
 
     def between(self, a: Anchor, b: Anchor) -> LoopClosure:
         """The same closure between other places."""
-        out = replace(self, a=a, b=b)
         if self.type != "distance" or self.length is not None:
-            # In the axes of the anchors, wherever these are.
-            object.__setattr__(out, "rows", self.rows)
+            _ = self.rows  # in the axes of the anchors, wherever these are: the copy has them, too
+        out = copy(self)
+        object.__setattr__(out, "a", a)
+        object.__setattr__(out, "b", b)
         return out
 
     @property

@@ -144,7 +144,7 @@ def sweep(
         raise InputError(
             f"chunk = {safe_repr(chunk)} is not a positive number of cases",
             element="chunk",
-            remedy="Give 1 or more, or leave it out",
+            remedy="Give 1 or more",
         )
     if executor is not None and not hasattr(executor, "submit"):
         raise InputError(

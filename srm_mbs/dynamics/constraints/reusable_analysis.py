@@ -6,6 +6,7 @@ Whether it is valid for a variant is checked by a short walk from its start.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from statistics import median
 
 import numpy as np
 
@@ -64,7 +65,7 @@ class ReusableAnalysis:
         walked = None if structure.notes else _walked(structure, mechanism)
         if walked is None:
             return None
-        last_pivot = float(np.median(walked.last_pivots(structure.rank)))
+        last_pivot = median(walked.last_pivots(structure.rank).tolist())
         rows, in_use = unscaled_rows(mechanism), rows_in_use(mechanism)
         return cls(structure, walked.largest, last_pivot, rows, in_use)
 
@@ -73,15 +74,20 @@ class ReusableAnalysis:
         rows with the places of its own closures, where these alone differ."""
         if mechanism.drives:
             return  # points that they move are anchors, too
-        rows = self.rows.moved(mechanism.model, mechanism.loops)
+        loops = mechanism.loops
+        if not all(loop.anchors for loop in loops):
+            return  # couplings have no places
+        rows = self.rows.moved(loops, [loop.resolve(mechanism.model) for loop in loops])
         if rows is not None:
             unscaled_rows.keep(mechanism, rows)
             anchor_points.keep(mechanism, rows.anchors())
 
     def lend_rows_in_use(self, mechanism: MechanismData) -> None:
-        """The same with the rows in use, for a variant that has this analysis."""
-        if not mechanism.drives:
-            rows = self.in_use.moved(mechanism.model, mechanism.loops)
+        """The same with the rows in use, for a variant that has this analysis and those of
+        :meth:`lend_rows`."""
+        unscaled = unscaled_rows.kept(mechanism)
+        if unscaled is not None and not mechanism.drives:
+            rows = self.in_use.moved(mechanism.loops, unscaled.places())
             if rows is not None:
                 rows_in_use.keep(mechanism, rows)
 
@@ -107,7 +113,8 @@ class ReusableAnalysis:
             return None
         used = structure.kept
         ratios = walked.largest[used] / self.lengths[used]
-        ratios = np.append(ratios, np.median(walked.last_pivots(structure.rank)) / self.last_pivot)
+        pivot = median(walked.last_pivots(structure.rank).tolist())
+        ratios = np.append(ratios, pivot / self.last_pivot)
         if not (ratios.min() > 1.0 / SIMILAR and ratios.max() < SIMILAR):
             return None
         return structure.at(mechanism)

@@ -439,6 +439,8 @@ class Samples:
         if not parts:
             nothing = np.zeros((0, 0))
             return cls([], nothing, nothing, np.zeros(rows))
+        if len(parts) == 1:
+            return parts[0]
         configurations = [q for part in parts for q in part.configurations]
         pivots = np.concatenate([part.pivots for part in parts])
         of_loops = np.concatenate([part.of_loops for part in parts])

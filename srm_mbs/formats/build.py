@@ -33,6 +33,7 @@ from srm_mbs.errors import (
 from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.plausibility import doubtful_angles, doubtful_inertias
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
+from srm_mbs.formats.translation import TreeParts
 from srm_mbs.formats.urdf.parser import UrdfModel, build_urdf, lock_joints
 from srm_mbs.formats.variants import Elements
 from srm_mbs.formats.xml import parse_xml
@@ -196,7 +197,7 @@ class Reading:
         Reads it again with other values of its parameters; None without parameters.
     analysis
         That of another variant of the description, if it is one.
-    shape, model
+    parts, model
         As of :class:`~srm_mbs.formats.translation.Translation`.
     elements
         Its elements, where they are not made from the tables of the description.
@@ -211,7 +212,7 @@ class Reading:
     kind: type[Mechanism] = Mechanism
     variants: VariantMaker | None = None
     analysis: ReusableAnalysis | None = None
-    shape: tuple[Any, ...] = ()
+    parts: TreeParts | None = None
     model: pin.Model | None = None
     elements: Elements | None = None
 

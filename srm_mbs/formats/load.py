@@ -170,7 +170,7 @@ def _translated(
         source,
         notes,
         translation.check,
-        shape=translation.shape,
+        parts=translation.parts,
         model=translation.model,
         elements=elements,
     )
@@ -292,9 +292,9 @@ def _known_linkage(reading: Reading, mechanism: Mechanism) -> KnownLinkage | Non
     variants need the URDF itself."""
     description, model = reading.description, mechanism.model
     changed = description.lock or description.massless != "refused" or model.armature.any()
-    if not reading.shape or changed or description.gravity_compensation:
+    if reading.parts is None or changed or description.gravity_compensation:
         return None
-    tree = KnownTree(reading.shape, model)
+    tree = KnownTree(reading.parts, model)
     # Variants take over the rows of those that the mechanism has as they are described.
     kept = {loop.name: loop for loop in mechanism.loops}
     described = description.closures()

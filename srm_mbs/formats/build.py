@@ -239,7 +239,8 @@ def unassembled(
     description, massless = _with_massless_ends(description, built.model)
     _check_joint_names(description, built.model)
     model, q, v, guess = _without_locked(description, built.model)
-    check_inertia(model, source.urdf_path)
+    if reading.model is None:  # the start of variants decides
+        check_inertia(model, source.urdf_path)
     elements = reading.elements
     if elements is None:
         _check_frames(description, model)
@@ -418,6 +419,27 @@ def _analysed(mechanism: Mechanism, reading: Reading) -> None:
     _ = mechanism.structure
 
 
+def _started(
+    mechanism: Mechanism, reading: Reading, q: Mapping[str, Any], v: Mapping[str, Any]
+) -> tuple[Mechanism, int | None]:
+    """The mechanism in a consistent start, and a joint that moves no inertia there.
+
+    Joints of a variant that all move inertia at the start do so elsewhere; whether others do is
+    looked at here, and comes before what else is wrong with them.
+    """
+    try:
+        found = consistent_start(mechanism, q, v).mechanism
+        started, joint = _with_rotors(found)
+        moves = joint is None and started is found
+    except (AssemblyError, EvaluationError):
+        if reading.model is not None:
+            check_inertia(mechanism.model, reading.source.urdf_path)
+        raise
+    if reading.model is not None and not moves:
+        check_inertia(mechanism.model, reading.source.urdf_path)
+    return started, joint
+
+
 def _with_doubts(mechanism: Mechanism, description: Description) -> Mechanism:
     """The mechanism with notes about values that look like those of other units, and about an axis
     that keeps a loop from moving; warnings say the same."""
@@ -460,7 +482,7 @@ def assembled(reading: Reading) -> Mechanism:
             if note:
                 mechanism = replace(reduced, notes=(*reduced.notes, note))
         # The mass matrix has to be regular before the analysis factorises it.
-        mechanism, joint = _with_rotors(consistent_start(mechanism, q, v).mechanism)
+        mechanism, joint = _started(mechanism, reading, q, v)
         if joint is None:
             _analysed(mechanism, reading)
     except AssemblyError as error:

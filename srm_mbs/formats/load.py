@@ -299,7 +299,7 @@ def _known_linkage(reading: Reading, mechanism: Mechanism) -> KnownLinkage | Non
     kept = {loop.name: loop for loop in mechanism.loops}
     described = description.closures()
     closures = tuple(kept[one.name] if kept.get(one.name) == one else one for one in described)
-    return KnownLinkage(tree, description, reading.entries, closures)
+    return KnownLinkage(tree, description, reading.entries, closures, mechanism.points)
 
 
 def _of_file(path: Path, overrides: Overrides) -> Reading:

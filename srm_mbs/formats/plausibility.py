@@ -56,7 +56,7 @@ def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:
         sizes[joint] = max(sizes[joint], math.hypot(*place.tolist()))
     for joint in range(1, model.njoints):
         body = model.inertias[joint]
-        half_trace = 0.5 * max(sum(body.inertia.diagonal().tolist()), 0.0)
+        half_trace = 0.5 * max(float(body.inertia.trace()), 0.0)
         if body.mass == 0.0:
             if half_trace > 0.0:
                 yield (

@@ -5,6 +5,7 @@ A tree must be in Pinocchio's order of joints, and its inertias must determine i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any, Protocol, TypeVar
@@ -123,7 +124,8 @@ def undetermined_joint(
         M = pin.crba(model, scratch(model), q)[::-1, ::-1]
         size = np.sqrt(M.diagonal())
         scaled = M / size[:, None] / size
-    if not np.isfinite(np.tril(M)).all():
+        finite = math.isfinite(np.add.reduce(M, axis=None))  # then each of them is
+    if not finite and not np.isfinite(np.tril(M)).all():
         raise InputError(
             "the mass matrix is not finite",
             file=file,
@@ -317,8 +319,7 @@ def checked_points(model: pin.Model, points: Any) -> dict[str, Anchor]:
         Unless every name is a text and every point an anchor on a link or frame of the model.
     """
     found: dict[str, Anchor] = {}
-    body = pin.FrameType.BODY
-    links = {frame.name for frame in model.frames if frame.type == body} if points else ()
+    links: set[str | None] = set()
     for name, anchor in named_values(points, "points").items():
         element = f"point {safe_repr(name)}"
         if not isinstance(name, str) or not isinstance(anchor, Anchor):
@@ -327,8 +328,9 @@ def checked_points(model: pin.Model, points: Any) -> dict[str, Anchor]:
                 element="points",
                 remedy='Give for example {"tip": srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))}',
             )
-        if anchor.link not in links:
+        if anchor.link is None or anchor.link not in links:
             with naming(element=element):
                 anchor.resolve(model)
+            links.add(anchor.link)
         found[name] = anchor
     return found

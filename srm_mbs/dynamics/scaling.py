@@ -212,10 +212,8 @@ def scene_diagonal(mechanism: MechanismData, q: FloatArray) -> float:
 def _diagonal(mechanism: MechanismData, data: pin.Data) -> float:
     """:func:`scene_diagonal` at the placements of ``data``."""
     joints, points = _marked_points(mechanism)
-    places = list(data.oMi)
-    rotations = np.array([place.rotation for place in places])[joints]
-    origins = np.array([place.translation for place in places])[joints]
-    corners = origins + (rotations @ points[:, :, None])[:, :, 0]
+    places = np.array([place.homogeneous for place in data.oMi])[joints]
+    corners = places[:, :3, 3] + (places[:, :3, :3] @ points[:, :, None])[:, :, 0]
     diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
     farthest = float(np.abs(corners).max())
     known_to = RELATIVE_ROUNDING * max(farthest, _gyration(mechanism))

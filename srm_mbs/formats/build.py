@@ -142,8 +142,10 @@ def _with_massless_ends(
     """Treat massless moving ends as the description says: lock their joints, or give their bodies
     the inertia of a ball in ``model``; returns the description and notes."""
     treatment = description.massless
+    if treatment == "refused":
+        return description, ()
     ends = [k for k in massless_ends(model) if model.names[k] not in description.lock]
-    if treatment == "refused" or not ends:
+    if not ends:
         return description, ()
     names = [str(model.names[k]) for k in ends]
     if not isinstance(treatment, str):

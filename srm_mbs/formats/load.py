@@ -181,20 +181,26 @@ def _of_description(
     overrides: Overrides,
     reach: Reach,
     urdf: str | None = None,
-    known: KnownLinkage | None = None,
+    origin: _Variants | None = None,
 ) -> Reading:
-    """Read a description; its model file is read from disk unless ``urdf`` is its text."""
+    """Read a description; its model file is read from disk unless ``urdf`` is its text.  A variant
+    has an ``origin``."""
     entries, values, notes = resolved(own.toml, overrides.parameters, own.file)
     given = own
     own = own if entries is own.toml else Document("", own.file)
     description = check_description(entries, own.file)
+    known = None if origin is None else origin.known
     reading, model = _of_tables(own, entries, description, overrides, reach, urdf, known)
-    return replace(
-        reading,
-        source=replace(reading.source, parameters=values),
-        notes=(*reading.notes, *notes),
-        variants=_Variants(given, overrides, reach, model) if values else None,
-    )
+    source = replace(reading.source, parameters=values)
+    notes = (*reading.notes, *notes)
+    if origin is not None:
+        further = replace(origin, overrides=overrides)
+        analysis, kind = origin.analysis, origin.kind
+        return replace(
+            reading, source=source, notes=notes, variants=further, analysis=analysis, kind=kind
+        )
+    variants = _Variants(given, overrides, reach, model) if values else None
+    return replace(reading, source=source, notes=notes, variants=variants)
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,9 +228,9 @@ class _Variants:
         values = {**self.overrides.parameters, **given_parameters(parameters)}
         with naming(file=self.own.file):
             overrides = replace(self.overrides, parameters=values)
-            reading = _of_description(self.own, overrides, self.reach, self.model, self.known)
-            mechanism = assembled(replace(reading, analysis=self.analysis, kind=self.kind))
-        variant_maker.keep(mechanism, replace(self, overrides=overrides))
+            reading = _of_description(self.own, overrides, self.reach, self.model, self)
+            mechanism = assembled(reading)
+        variant_maker.keep(mechanism, reading.variants)
         return mechanism
 
 

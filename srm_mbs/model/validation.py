@@ -320,6 +320,7 @@ def checked_points(model: pin.Model, points: Any) -> dict[str, Anchor]:
     """
     found: dict[str, Anchor] = {}
     links: set[str | None] = set()
+    body = pin.FrameType.BODY
     for name, anchor in named_values(points, "points").items():
         element = f"point {safe_repr(name)}"
         if not isinstance(name, str) or not isinstance(anchor, Anchor):
@@ -329,8 +330,9 @@ def checked_points(model: pin.Model, points: Any) -> dict[str, Anchor]:
                 remedy='Give for example {"tip": srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))}',
             )
         if anchor.link is None or anchor.link not in links:
-            with naming(element=element):
-                anchor.resolve(model)
+            if anchor.link is None or not model.existFrame(anchor.link, body):
+                with naming(element=element):
+                    anchor.resolve(model)
             links.add(anchor.link)
         found[name] = anchor
     return found

@@ -77,6 +77,10 @@ LEAST_COMMON = 16
 """Number of loops that share a coordinate up to which the coordinate makes them neighbours."""
 
 
+KEPT_ORDERS = 32
+"""Patterns of which the order and the columns of rows are kept."""
+
+
 def graph_order(pattern: BoolArray, parents: Sequence[int]) -> tuple[int, ...]:
     """All rows along the graph of the loops; () for up to 64 coordinates, or if W is full.
 
@@ -92,7 +96,7 @@ def graph_order(pattern: BoolArray, parents: Sequence[int]) -> tuple[int, ...]:
     return _ordered(pattern.shape, np.packbits(pattern).tobytes(), tuple(parents))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=KEPT_ORDERS)
 def _ordered(shape: tuple[int, int], bits: bytes, parents: tuple[int, ...]) -> tuple[int, ...]:
     size = shape[0] * shape[1]
     pattern = np.unpackbits(np.frombuffer(bits, np.uint8), count=size).reshape(shape).astype(bool)
@@ -359,10 +363,18 @@ def row_algebra(pattern: BoolArray, model: pin.Model | None = None) -> RowAlgebr
 def _compiled(pattern: BoolArray, parents: Sequence[int], order: Sequence[int]) -> CompiledAlgebra:
     from srm_mbs._kernel import core
 
-    supports = [[j for j, used in enumerate(row) if used] for row in pattern.tolist()]
+    supports = _supports(pattern.shape, np.packbits(pattern).tobytes())
     return CompiledAlgebra(
         core.Algebra(list(parents), supports, list(order), PIVOT_SHARE, PIVOT_WINDOW, "auto")  # type: ignore[union-attr]
     )
+
+
+@lru_cache(maxsize=KEPT_ORDERS)
+def _supports(shape: tuple[int, int], bits: bytes) -> list[list[int]]:
+    """The columns of each row of a pattern, from its bits; nothing may change them.  Variants of a
+    mechanism have the same."""
+    entries = np.unpackbits(np.frombuffer(bits, dtype=np.uint8), count=shape[0] * shape[1])
+    return [np.flatnonzero(row).tolist() for row in entries.reshape(shape)]
 
 
 def coordinate_parents(model: pin.Model) -> list[int]:

@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs._kernel.workspace import share_scratch
 from srm_mbs.formats.graph.joint_graph import Body, Joint
 from srm_mbs.formats.graph.spanning_tree_to_urdf import is_identity
 from srm_mbs.formats.translation import KnownTree, TreeParts
@@ -71,6 +72,7 @@ def model_of_variant(
     if not _plain(list(heavier.values()), [joint.in_parent for joint in moved]):
         return None
     model = known.model.copy()
+    share_scratch(known.model, model)
     for joint in moved:
         number = model.getJointId(joint.name)
         place = joint.in_parent

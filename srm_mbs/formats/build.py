@@ -248,14 +248,15 @@ def unassembled(
         _check_frames(description, model)
     start = pin.neutral(model)
     for where, values in (("initial.guess", guess), ("initial.q", q)):
-        for name, value in values.items():
-            with naming(element=where):
+        with naming(element=where):
+            for name, value in values.items():
                 write_position(model.joints[model.getJointId(name)], start, name, value)
     for name, value in v.items():
         with naming(element="initial.v"):
             write_rate(model.joints[model.getJointId(name)], np.zeros(model.nv), name, value)
     defaults = description.simulation
-    csv = CsvFolder(Path(source.path).parent, source.reach) if tables else None
+    reads = tables and (description.force or description.drive)
+    csv = CsvFolder(Path(source.path).parent, source.reach) if reads else None
     friction_speed = description.friction_speed
     actuators, idle = description.named_actuators()
     forces = (

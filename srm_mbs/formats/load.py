@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from numbers import Integral
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,10 @@ log = get_logger(__name__)
 
 GENERATED = re.compile(r"n_four_bar_([1-9][0-9]{0,8})\Z")
 """Names of generated mechanisms, with the number of loops."""
+
+
+KEPT_NAMES = 64
+"""Files whose URDFs have names already: variants are read from one file."""
 
 
 def models_folder() -> Path:
@@ -102,6 +106,12 @@ def _checked_base(base: Any) -> str:
     return base
 
 
+@lru_cache(maxsize=KEPT_NAMES)
+def _urdf_name(file: str) -> str:
+    """Name of the URDF that a translation of ``file`` makes."""
+    return Path(file).with_suffix(".urdf").name
+
+
 def _translated(
     own: Document,
     entries: Mapping[str, Any],
@@ -138,8 +148,7 @@ def _translated(
         translation = replace(translation, write=None)  # the text of the changed tree
         entries, as_read = without_overrides(entries), False
     if translation.entries or found.key != "urdf":
-        urdf_name = Path(model.file).with_suffix(".urdf").name
-        entries = merged(entries, translation.entries, urdf_name)
+        entries = merged(entries, translation.entries, _urdf_name(model.file))
         as_read = False
     elements = None
     if known is not None and translation.model is not None and not given:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from typing import Any
 
 import pinocchio as pin
@@ -11,6 +12,7 @@ import pinocchio as pin
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import (
     anchor_points,
+    body_numbers,
     coordinate_units,
     is_angle,
     scene_diagonal,
@@ -54,9 +56,8 @@ def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:
     ends += anchor_points(mechanism)
     for joint, place in ends:
         sizes[joint] = max(sizes[joint], math.hypot(*place.tolist()))
-    for joint in range(1, model.njoints):
-        body = model.inertias[joint]
-        half_trace = 0.5 * max(float(body.inertia.trace()), 0.0)
+    for joint, body in islice(enumerate(body_numbers(mechanism)), 1, None):
+        half_trace = 0.5 * body.trace
         if body.mass == 0.0:
             if half_trace > 0.0:
                 yield (

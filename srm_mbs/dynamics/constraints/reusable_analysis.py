@@ -6,6 +6,7 @@ Whether it is valid for a variant is checked by a short walk from its start.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from statistics import median
 
 import numpy as np
@@ -20,8 +21,10 @@ from srm_mbs.dynamics.constraints.structure import (
     STRUCTURAL_PIVOT,
     ZERO_ROW,
     ManifoldSampler,
+    RandomSteps,
     Samples,
     Structure,
+    random_steps,
     row_names,
     rows_in_use,
     structure_of,
@@ -31,6 +34,8 @@ from srm_mbs.model.mechanism import MechanismData
 
 CHECKED_STEPS = 6
 """Closed configurations, beside the start, in which an analysis of a variant is checked."""
+KEPT_WALKS = 16
+"""Walks that are kept, by the number of coordinates."""
 SIMILAR = 4.0
 """Largest ratio of row norms, and of last pivots, of two mechanisms with one analysis."""
 
@@ -120,6 +125,15 @@ class ReusableAnalysis:
         return structure.at(mechanism)
 
 
+@lru_cache(maxsize=KEPT_WALKS)
+def _steps(nv: int) -> RandomSteps:
+    """The steps of the walk, the same for all mechanisms of ``nv`` coordinates; read-only."""
+    steps = random_steps(np.random.default_rng(0), CHECKED_STEPS, nv)
+    for array in steps:
+        array.setflags(write=False)
+    return steps
+
+
 def _walked(structure: Structure, mechanism: MechanismData) -> Samples | None:
     """A walk of ``CHECKED_STEPS`` from the start of ``mechanism``, with the row scales of
     ``structure``; None if it contradicts the ranks and zero rows of that, or finds nothing."""
@@ -129,8 +143,8 @@ def _walked(structure: Structure, mechanism: MechanismData) -> Samples | None:
     start, error = sampler.close(mechanism.q0, CLOSING_STEPS)
     if not rank or not error < CLOSED:
         return None
-    rng = np.random.default_rng(0)
-    samples = sampler.explore(start, rng, 1, CHECKED_STEPS, mechanism.v0, sample_start=True)
+    walk = [_steps(int(mechanism.model.nv))]
+    samples = sampler.explore_along(start, walk, mechanism.v0, sample_start=True)
     loops = int((samples.of_loops > STRUCTURAL_PIVOT).sum(axis=1).max())
     if int(samples.ranks().max()) != rank or loops != structure.loop_rank:
         return None

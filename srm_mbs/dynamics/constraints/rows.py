@@ -509,7 +509,9 @@ class LoopKinematics:
 
     def anchors(self) -> list[tuple[int, FloatArray]]:
         """Joint, and origin (3,) in its axes, of the anchors of all closures that have rows."""
-        return [(joint, place.translation.copy()) for ends in self.places() for joint, place in ends]
+        return [
+            (joint, place.translation.copy()) for ends in self.places() for joint, place in ends
+        ]
 
     @property
     def is_constant(self) -> bool:

@@ -65,9 +65,7 @@ def model_of_variant(
         if body.inertia is not None and body.inertia != own.inertia
     }
     moved = [
-        joint
-        for joint, own in zip(joints, known.parts.joints)
-        if joint.in_parent != own.in_parent
+        joint for joint, own in zip(joints, known.parts.joints) if joint.in_parent != own.in_parent
     ]
     if not _plain(list(heavier.values()), [joint.in_parent for joint in moved]):
         return None

@@ -104,8 +104,8 @@ class Translation:
     check
         Raises InputError if the assembled mechanism cannot be what the file is meant to describe.
     parts
-        The bodies and joints of the tree, for :class:`KnownTree`; None where variants are built from
-        their tree, or made from another.
+        The bodies and joints of the tree, for :class:`KnownTree`; None where variants are built
+        from their tree, or made from another.
     model
         Pinocchio's model, if it was made from that of a :class:`KnownTree`: ``tree`` is empty.
     """

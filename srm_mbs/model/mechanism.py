@@ -240,6 +240,14 @@ def variant_maker(mechanism: MechanismData) -> VariantMaker | None:
     return None
 
 
+@per_model
+def variant_origin(mechanism: MechanismData) -> MechanismData | None:
+    """The mechanism of which this one was made by :meth:`MechanismData.with_parameters`, or of
+    which that one was: much of what follows from both may be the same, which users have to check.
+    None for others."""
+    return None
+
+
 FRICTION_SPEED = 0.01
 """Default of ``friction_speed``, rad/s or m/s."""
 
@@ -424,7 +432,9 @@ class MechanismData(ResultOwner):
                 remedy="Give srm.load a description with [parameters], and change the result after "
                 "with_parameters, not before",
             )
-        return make(values)  # type: ignore[no-any-return]
+        made: Self = make(values)
+        variant_origin.keep(made, variant_origin(self) or self)
+        return made
 
     @property
     def constrained(self) -> bool:

@@ -46,8 +46,8 @@ and a progress bar still moves."""
 LONGEST_CHUNK = 2.0
 """Time of such a chunk, over ``CHUNK_SECONDS``, after which a worker begins no further case."""
 GROWTH = 4
-"""Largest ratio of the lengths of such a chunk and of the one that it follows from: the first run of
-a worker takes longer than others."""
+"""Largest ratio of the lengths of such a chunk and of the one that it follows from: the first run
+of a worker takes longer than others."""
 SHORTEST_TIME = 1e-6
 """Time (s) of a chunk below which it is not measured."""
 _REFUSED_OPTIONS = {
@@ -101,9 +101,9 @@ def sweep(
         Any executor with the interface of ``concurrent.futures``; by default the cases run
         sequentially in this thread.  Threads share the mechanism; processes get it pickled.
     chunk
-        Number of cases that a worker runs at a time, which are lost together if it dies.  By default
-        as many as take about 0.05 s, by what the last ones took: a worker that dies then loses what
-        it did in the last 0.1 s, and the case that it was at.
+        Number of cases that a worker runs at a time, which are lost together if it dies.  By
+        default as many as take about 0.05 s, by what the last ones took: a worker that dies then
+        loses what it did in the last 0.1 s, and the case that it was at.
     resume
         A file to which every finished case is appended; the cases that it already has are read
         instead of being run.  Cases that raised an exception are repeated.
@@ -264,7 +264,7 @@ def _finished(
         return
     sent = task if isinstance(executor, ThreadPoolExecutor) else packed(task)
     waiting = _Waiting(cases, chunk)
-    running: dict[Future[Ran], Sequence[Case]] = {}
+    running: dict[Future[Ran], list[Case]] = {}
     done: SimpleQueue[Future[Ran]] = SimpleQueue()
     try:
         while True:

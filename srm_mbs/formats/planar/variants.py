@@ -51,9 +51,9 @@ def _plain(inertias: Sequence[pin.Inertia], places: Sequence[pin.SE3]) -> bool:
 def model_of_variant(
     known: KnownTree | None, bodies: Sequence[Body], joints: Sequence[Joint]
 ) -> pin.Model | None:
-    """The model of a tree whose links have their frames at their joints; None unless it is the known
-    one with other translations of joints and inertias, about which the check of a tree would say
-    nothing.
+    """The model of a tree whose links have their frames at their joints; None unless it is the
+    known one with other translations of joints and inertias, about which the check of a tree would
+    say nothing.
 
     Every joint is in its parent with the axes of this.
     """

@@ -208,7 +208,7 @@ def _unpacked(data: bytes) -> Task:
 
 
 class Ran(NamedTuple):
-    """What a worker did with a chunk.
+    """Outcomes of a chunk, from the worker that ran it.
 
     Attributes
     ----------

@@ -228,7 +228,7 @@ class ClosureProblem(ClosureGeometry):
         turning = _periodic_coordinates(self.mechanism)
         indices = [
             (joint.idx_q + k, joint.idx_v + k)
-            for name, joint in zip(self.mechanism.joint_names, list(self.model.joints)[1:])
+            for name, joint in zip(self.mechanism.joint_names, self.model.joints.tolist()[1:])
             for k in range(joint.nv)
             if turning[joint.idx_v + k] and name not in coupled
         ]

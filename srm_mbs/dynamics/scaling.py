@@ -213,7 +213,7 @@ def scene_diagonal(mechanism: MechanismData, q: FloatArray) -> float:
 def _diagonal(mechanism: MechanismData, data: pin.Data) -> float:
     """:func:`scene_diagonal` at the placements of ``data``."""
     joints, points = _marked_points(mechanism)
-    places = np.array([place.homogeneous for place in data.oMi])[joints]
+    places = np.array([place.homogeneous for place in data.oMi.tolist()])[joints]
     corners = places[:, :3, 3] + (places[:, :3, :3] @ points[:, :, None])[:, :, 0]
     diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
     farthest = float(np.abs(corners).max())
@@ -244,7 +244,7 @@ def body_numbers(mechanism: MechanismData) -> list[BodyNumbers]:
     return [
         # Lumping and shifting may round the trace of a point mass to a negative number.
         BodyNumbers(float(body.mass), body.lever.copy(), max(float(body.inertia.trace()), 0.0))
-        for body in mechanism.model.inertias
+        for body in mechanism.model.inertias.tolist()
     ]
 
 

@@ -41,6 +41,7 @@ from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.coordinates import write_position, write_rate
 from srm_mbs.model.forces import ForceElement, Wrench
 from srm_mbs.model.mechanism import SimulationDefaults, Source, VariantMaker
+from srm_mbs.model.numbers import vector_elements
 from srm_mbs.model.validation import check_inertia, massless_ends, undetermined_joint
 
 log = get_logger(__name__)
@@ -61,7 +62,7 @@ def _acting_joints(description: Description) -> Iterator[tuple[str, str]]:
 def _check_joint_names(description: Description, model: pin.Model) -> None:
     """Refuse names that are no moving joints, and joints that are locked but act or are given
     twice."""
-    known = tuple(model.names)[1:]
+    known = tuple(vector_elements(model.names)[1:])
     initial = description.initial
     given = [("lock", name) for name in description.lock]
     for part in ("q", "v", "guess"):

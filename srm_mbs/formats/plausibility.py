@@ -17,6 +17,7 @@ from srm_mbs.dynamics.scaling import (
     is_angle,
     scene_diagonal,
 )
+from srm_mbs.model.numbers import vector_elements
 
 LARGEST_START = 4.0 * math.pi
 """Angle (rad) of a start above which it may be in degrees."""
@@ -51,7 +52,7 @@ def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:
     if scene == 1.0:
         scene = scene_diagonal(mechanism, mechanism.q0)
     sizes = [0.0] * model.njoints
-    parents, places = list(model.parents), list(model.jointPlacements)
+    parents, places = vector_elements(model.parents), model.jointPlacements.tolist()
     ends = [(parents[joint], places[joint].translation) for joint in range(1, model.njoints)]
     ends += anchor_points(mechanism)
     for joint, place in ends:

@@ -27,7 +27,7 @@ from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive, positions
 from srm_mbs.model.forces import ForceElement
 from srm_mbs.model.laws import Curve, Law
-from srm_mbs.model.numbers import checked_name
+from srm_mbs.model.numbers import checked_name, vector_elements
 from srm_mbs.model.pinocchio_constraints import (
     PinocchioConstraints,
     closures_from_pinocchio,
@@ -522,7 +522,7 @@ class MechanismData(ResultOwner):
 
 @per_model
 def _joint_names(mechanism: MechanismData) -> tuple[str, ...]:
-    return tuple(mechanism.model.names)[1:]
+    return tuple(vector_elements(mechanism.model.names)[1:])
 
 
 @per_model

@@ -18,7 +18,7 @@ from srm_mbs._kernel.workspace import scratch
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, known_names, naming, safe_repr
 from srm_mbs.model.anchors import Anchor
-from srm_mbs.model.numbers import finite_array, named_values
+from srm_mbs.model.numbers import finite_array, named_values, vector_elements
 
 ARTICULATED_INERTIA_TOLERANCE = 1e-13
 """Articulated inertia, over the composite one, below which it is rounding."""
@@ -84,7 +84,7 @@ def _motion(size: int) -> FloatArray:
 def massless_ends(model: pin.Model) -> list[int]:
     """The joints that move neither mass, inertia nor armature of their own, from the root to the
     tips."""
-    parents, moves = list(model.parents), [False] * model.njoints
+    parents, moves = vector_elements(model.parents), [False] * model.njoints
     for joint in range(model.njoints - 1, 0, -1):
         if moves[joint] or _has_inertia(model.inertias[joint]):
             moves[joint] = moves[parents[joint]] = True
@@ -182,7 +182,7 @@ def check_tree(model: pin.Model) -> None:
 
 def _check_order(model: pin.Model) -> None:
     """Refuse joints out of order: Pinocchio's crba would return a wrong mass matrix, silently."""
-    parents, branch = list(model.parents), [0]
+    parents, branch = vector_elements(model.parents), [0]
     for joint in range(1, model.njoints):
         while branch and branch[-1] != parents[joint]:
             branch.pop()

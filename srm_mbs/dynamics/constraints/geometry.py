@@ -108,7 +108,7 @@ class ClosureGeometry:
     @cached_property
     def commutes(self) -> bool:
         """Whether moves commute: no ball, planar or free joints."""
-        joints = list(self.model.joints)[1:]
+        joints = self.model.joints.tolist()[1:]
         return all(joint.nq == joint.nv or joint.nv == 1 for joint in joints)
 
     @cached_property

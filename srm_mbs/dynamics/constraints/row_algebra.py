@@ -44,6 +44,7 @@ from srm_mbs.dynamics.constraints.projection import (
     whiten,
 )
 from srm_mbs.errors import EvaluationError
+from srm_mbs.model.numbers import vector_elements
 
 GRAPH_ORDER_ABOVE = 64
 """Coordinates above which pivots are taken along the graph of the loops."""
@@ -380,7 +381,7 @@ def _supports(shape: tuple[int, int], bits: bytes) -> list[list[int]]:
 def coordinate_parents(model: pin.Model) -> list[int]:
     """The next coordinate to the root of each velocity component (nv,); -1 at the root."""
     parents = [-1] * int(model.nv)
-    bodies, starts, sizes = (list(each) for each in (model.parents, model.idx_vs, model.nvs))
+    bodies, starts, sizes = map(vector_elements, (model.parents, model.idx_vs, model.nvs))
     for i in range(1, model.njoints):
         parent = bodies[i]
         above = starts[parent] + sizes[parent] - 1 if parent else -1
@@ -391,7 +392,7 @@ def coordinate_parents(model: pin.Model) -> list[int]:
 
 def trees(model: pin.Model) -> list[slice]:
     """Velocity components of each tree that is rooted in the ground: the blocks of M."""
-    at, parents = list(model.idx_vs), list(model.parents)
+    at, parents = vector_elements(model.idx_vs), vector_elements(model.parents)
     starts = [at[i] for i in range(1, model.njoints) if not parents[i]]
     return [slice(a, b) for a, b in zip(starts, [*starts[1:], int(model.nv)])]
 

@@ -77,6 +77,8 @@ class ClosureProblem(ClosureGeometry):
     configuration."""
 
     _latest: tuple[bytes, FloatArray, FloatArray, FloatArray] | None = None
+    _latest_mismatch: tuple[FloatArray, FloatArray] | None = None
+    """g of one of them, and the mismatch there."""
 
     def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As of every geometry, by the kernel where there is one; nothing may change the arrays."""
@@ -164,7 +166,12 @@ class ClosureProblem(ClosureGeometry):
     def mismatch(self, q: FloatArray) -> FloatArray:
         """Residual whose only zeros are the intended closed configurations: distances (in units)
         and differences of axes."""
-        return self._mismatch(self.closure(q)[0])
+        g = self.closure(q)[0]
+        if self._latest_mismatch is None or self._latest_mismatch[0] is not g:
+            found = self._mismatch(g)
+            found.setflags(write=False)
+            self._latest_mismatch = g, found
+        return self._latest_mismatch[1]
 
     def linearised(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """:meth:`mismatch`, and its derivative for motions of the joints in units (entries, nv)."""

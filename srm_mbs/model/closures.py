@@ -34,7 +34,7 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, safe_repr
-from srm_mbs.model.anchors import Anchor, name_places, one_degree_joint, resolve_apart
+from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
 from srm_mbs.model.numbers import checked_name, finite_number, finite_numbers, plain, unit_vector
 
 
@@ -604,7 +604,7 @@ class LoopClosure:
         """
         if self.anchors:
             a, b = self.anchors
-            resolve_apart(model, a, b, self._element)
+            check_apart(model, a, b, self._element)
         for name in self.joints or ():
             instead = "Couple joints with one degree of freedom"
             joint = one_degree_joint(model, name, self._element, instead)

@@ -48,6 +48,7 @@ from srm_mbs.formats.planar.shapes import (
     pin_visual,
     rod,
     slender,
+    slender_body,
     turned,
 )
 from srm_mbs.formats.planar.variants import model_of_variant, plain_parts
@@ -387,8 +388,7 @@ class _Linkage:
         if bar.centre is not None:
             place = drawing.unit * np.array(bar.centre)
             centre = drawing.on_body(body, place) - self.origins[body]
-        moment = mass * shape.tensor[1, 1] if bar.inertia is None else bar.inertia
-        return body_inertia(mass, centre, moment * shape.tensor / shape.tensor[1, 1])
+        return slender_body(shape, mass, centre, bar.inertia)
 
     # -- closures, forces, start ---------------------------------------------------------------
 

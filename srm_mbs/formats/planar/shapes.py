@@ -143,7 +143,7 @@ def outline(points: FloatArray) -> list[tuple[int, int]]:
     return list(zip(ring, [*ring[1:], ring[0]]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Slender:
     """Slender bars of 1 kg in all along the outline of points.
 
@@ -194,6 +194,22 @@ def _slender(shape: tuple[int, ...], numbers: bytes) -> Slender:
         yy += w * (q * q / 12.0 + v * v)
     tensor = np.array([[yy, 0.0, -xy], [0.0, xx + yy, 0.0], [-xy, 0.0, xx]])
     return Slender(length, np.array([x, y]), tensor)
+
+
+def slender_body(
+    shape: Slender, mass: float, centre: FloatArray, moment: float | None
+) -> pin.Inertia:
+    """Inertia of a body of ``mass`` (kg) about its ``centre`` (2,): that of slender bars, scaled to
+    a ``moment`` (kg m^2) in the plane if there is one; nothing may change the result."""
+    return _slender_body(shape, float(mass), centre.tobytes(), moment)
+
+
+@lru_cache(maxsize=KEPT_SHAPES)
+def _slender_body(shape: Slender, mass: float, centre: bytes, moment: float | None) -> pin.Inertia:
+    """:func:`slender_body` from the bytes of the centre."""
+    turning = shape.tensor[1, 1]
+    moment = mass * turning if moment is None else moment
+    return body_inertia(mass, np.frombuffer(centre), moment * shape.tensor / turning)
 
 
 def body_inertia(mass: float, centre: FloatArray, tensor: FloatArray) -> pin.Inertia:

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from scipy.linalg import blas
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
@@ -98,24 +99,24 @@ class OpenTerms:
 
 
 class ClosedTerms:
-    """Terms of one stage of a closed-loop mechanism, which the factorisation of the system has.
+    """Terms of the stage of a closed-loop mechanism that was evaluated last, from the factorisation
+    of the ``system``.
 
-    Parameters
+    Attributes
     ----------
-    system
-        The mechanism, with the rows and the factorisation at the stage.
     v : (nv,)
         Velocity.
     predicted : (nv,) or None
         yhat of the zone, of which the part of dropped rows is used.
+    white_multiplier : (nv,)
+        L^T yhat.
     """
 
-    def __init__(self, system: ClosedSystem, v: FloatArray, predicted: FloatArray | None) -> None:
-        self._p = system.projection
-        self._loops = system.loops
-        self._residual_scale = system.residual_scale
-        self._driven = bool(system.mechanism.drives)
-        self._v, self._predicted = v, predicted
+    def __init__(self, system: ClosedSystem) -> None:
+        self._system, self._p, self._loops = system, system.projection, system.loops
+        self.v = np.zeros(system.nv)
+        self.predicted: FloatArray | None = None
+        self.white_multiplier = self.v
 
     @property
     def sigma(self) -> float:
@@ -129,30 +130,19 @@ class ClosedTerms:
     def rank_deficient(self) -> bool:
         return self._p.rank_deficient
 
-    def _completed(self, white: FloatArray) -> FloatArray:
-        """The strong part of a multiplier, in L^T coordinates, plus (1 - P_s) yhat_pred."""
-        if self._predicted is None:
-            return white
-        p = self._p
-        prediction = p.U @ self._predicted
-        return white + prediction - p.Q @ (p.Q.T @ prediction)
-
     @property
     def held(self) -> bool:
         return self._p.held is not None
 
     def normals(self) -> FloatArray:
-        return np.zeros((self._v.size, 0)) if self._driven else self._p.normals()
-
-    def _white_multiplier(self) -> FloatArray:
-        return self._completed(self._p.white_multiplier)
+        return np.zeros((self.v.size, 0)) if self._system.driven else self._p.normals()
 
     def rate(self) -> FloatArray:
         p = self._p
-        return np.concatenate([self._v, p.unwhiten(p.white_force - self._white_multiplier())])
+        return np.concatenate([self.v, unwhiten(p.U, p.white_force - self.white_multiplier)])
 
     def multiplier(self) -> FloatArray:
-        return self._p.unwhiten(self._white_multiplier())
+        return self._p.unwhiten(self.white_multiplier)
 
     def prediction(self) -> FloatArray:
         return self.multiplier()
@@ -164,15 +154,17 @@ class ClosedTerms:
         """L^T (P w - s E s'): with w = v and s = 1 that of the rates that violate G v = s'."""
         p = self._p
         white = p.white_project(w)
-        return white - s * p.normal(self._loops.target_rate[p.order]) if self._driven else white
+        if not self._system.driven:
+            return white
+        return white - s * p.normal(self._loops.target_rate)
 
     def constraint_residual(self) -> float:
-        return float(np.abs(self._loops.g * self._residual_scale).max())
+        return float(np.abs(self._loops.g * self._system.residual_scale).max())
 
     def correction(self) -> FloatArray:
         p = self._p
-        position = p.normal(self._loops.g[p.order])
-        return np.concatenate([p.unwhiten(position), p.unwhiten(self._white_rates(self._v))])
+        position = p.normal(self._loops.g)
+        return np.concatenate([p.unwhiten(position), p.unwhiten(self._white_rates(self.v))])
 
     def free_acceleration(self) -> FloatArray:
         """M^-1 f (nv,)."""
@@ -187,7 +179,7 @@ class ClosedTerms:
     def multiplier_of(self, a: FloatArray) -> FloatArray:
         """E (G a + Gdot v - s'') (nv,) of the free acceleration ``a`` (nv,)."""
         p = self._p
-        return p.unwhiten(p.white_project(a) + p.normal(self._loops.bias[p.order]))
+        return p.unwhiten(p.white_project(a) + p.normal(self._loops.bias))
 
     def driven_residuals(self) -> FloatArray:
         """g - s of the rows of the drives."""
@@ -197,13 +189,13 @@ class ClosedTerms:
         """E g (nv,), without ``allowed`` of the rows of the drives."""
         g = self._loops.g.copy()
         g[self._loops.driven_rows] -= allowed
-        return self._p.unwhiten(self._p.normal(g[self._p.order]))
+        return self._p.unwhiten(self._p.normal(g))
 
     def branch_tangents(self) -> FloatArray:
         """M-orthonormal velocities (nv, k) that satisfy the closures, whatever the drives."""
         p, rows = self._p, self._loops.driven_rows
         units = np.eye(len(self._loops.g))[:, rows]
-        driven = np.array([p.normal(unit[p.order]) for unit in units.T]).reshape(-1, len(self._v))
+        driven = np.array([p.normal(unit) for unit in units.T]).reshape(-1, len(self.v))
         whole = np.linalg.norm(driven, axis=1)
         own: list[FloatArray] = []
         for white, size in zip(driven, whole):
@@ -218,9 +210,11 @@ class ClosedTerms:
 
     def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
         p = self._p
-        position = p.unwhiten(p.normal(self._loops.g[p.order]))
-        white = self._completed(self._white_rates(previous + self._v / eps, 1.0 / eps))
-        rate = np.concatenate([self._v - position / eps, p.unwhiten(p.white_force - white)])
+        position = p.unwhiten(p.normal(self._loops.g))
+        white = self._white_rates(previous + self.v / eps, 1.0 / eps)
+        if self.predicted is not None:
+            white = p.completed(white, self.predicted)
+        rate = np.concatenate([self.v - position / eps, p.unwhiten(p.white_force - white)])
         return rate, p.unwhiten(white)
 
 
@@ -239,6 +233,7 @@ class Mechanics(Manifold):
         self._damping: FloatArray = self.model.damping.copy()
         self._friction: FloatArray = self.model.friction.copy()
         self._is_damped, self._has_friction = bool(self._damping.any()), bool(self._friction.any())
+        self._is_loaded = self._is_damped or self._has_friction or controller is not None
         self.friction_speed = mechanism.friction_speed
         self._forces = resolved_forces(mechanism)
         self._first, self._last = -np.inf, np.inf
@@ -510,7 +505,7 @@ tolerance far above that speed never lets a joint come to rest."""
 DEPENDENT_DRIVE = 1e-10
 """Part of a drive's motion without those of others below which it is one of theirs."""
 _OVERFLOW = 1e100
-"""Largest |x_i| of a state above which products of its rates may overflow."""
+"""Sum of |x_i| of a state above which products of its rates may overflow."""
 
 
 class OpenSystem(Mechanics):
@@ -587,6 +582,7 @@ class ClosedSystem(Mechanics):
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
         self.structure = mechanism.structure
+        self.driven = bool(mechanism.drives)
         self.residual_scale = _residual_scale(mechanism)
         self._order = _graph_order(mechanism)
         self.projection = Projection(self.structure.rank, self.structure.sigma_ref, self._order)
@@ -596,6 +592,15 @@ class ClosedSystem(Mechanics):
         """The rows of closures and drives that are in use, with memory of their own."""
         curves = self.mechanism.drive_curves
         return rows_in_use(self.mechanism).copy_workspace().follow(curves)
+
+    @cached_property
+    def _terms(self) -> ClosedTerms:
+        return ClosedTerms(self)
+
+    @cached_property
+    def _mass_matrix(self) -> FloatArray:
+        """View (nv, nv) of what crba writes: finding it takes as long as a solve."""
+        return self.data.M  # type: ignore[no-any-return]
 
     @cached_property
     def _joined(self) -> ForceKinematics | None:
@@ -669,22 +674,25 @@ class ClosedSystem(Mechanics):
         """
         self.evaluations += 1
         # First, because LAPACK may factorise numbers that are not finite without reporting it.
-        if not np.abs(state).max() < _OVERFLOW:
+        if not blas.dasum(state) < _OVERFLOW:
             raise EvaluationError("the state is not finite, or overflows")
         t = min(max(t, self._first), self._last)
         model, data, nq = self.model, self.data, self.nq
         q, v = state[:nq], state[nq:]
         pin.crba(model, data, q, pin.Convention.WORLD)
-        f = self.applied_force(t, q, v) - pin.nonLinearEffects(model, data, q, v)
+        f = -pin.nonLinearEffects(model, data, q, v)
+        if self._is_loaded or self._applied is not None:
+            f += self.applied_force(t, q, v)
         if self._forces is not None:
             f += self._element_force(self._forces, t, q, v)
         self._laws_at = q, v
         loops = self.loops
         loops.update(data, q, v)
-        loops.move_to(t)
+        if self.driven:
+            loops.move_to(t)
         projection = self.projection
         threshold = None if zone is None else zone.threshold
-        projection.factor(data.M, loops.G, f, loops.bias, threshold)
+        projection.factor(self._mass_matrix, loops.G, f, loops.bias, threshold)
         predicted = None
         if projection.rank_deficient and zone is not None:
             predicted = zone.predict(t)
@@ -698,7 +706,12 @@ class ClosedSystem(Mechanics):
                         "lead to one that it cannot pass"
                     )
                 projection.hold(zone.normals)
-        return ClosedTerms(self, v, predicted)
+        terms = self._terms
+        terms.v, terms.predicted = v, predicted
+        terms.white_multiplier = projection.white_multiplier
+        if predicted is not None:
+            terms.white_multiplier = projection.completed(terms.white_multiplier, predicted)
+        return terms
 
     def derivatives(
         self, state: FloatArray, accelerations: FloatArray

@@ -649,8 +649,10 @@ class CriticalPassages:
     def crossing(self, result: StepResult) -> float | None:
         """When (s) the step of ``result`` passes a singular configuration that has not been
         examined; None if it does not."""
+        if self._known or result.quiet:
+            return None
         lowest = int(np.argmin(result.sigmas))
-        if self._known or result.quiet or lowest == 0 or not may_cross(result):
+        if lowest == 0 or not may_cross(result):
             return None
         abscissae = self._scheme.member(result.stiff).abscissae
         zero = zero_within(abscissae, result.sigmas)

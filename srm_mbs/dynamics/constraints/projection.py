@@ -11,7 +11,8 @@ next to a singular configuration; pivots are dropped for redundancy only, or in 
 prediction takes their place.
 
 LAPACK is called directly: the checks of ``scipy.linalg.qr`` and ``solve_triangular`` take 10 to
-30 us each, as long as a whole stage of a small mechanism.
+30 us each, as long as a whole stage of a small mechanism.  Its arguments are by position, since a
+name takes half as long as a solve; :func:`whiten` and :func:`unwhiten` are where they are written.
 
 The next pivot is the column of the largest remaining norm.  With many loops the search follows
 their graph instead (:func:`swept_qr`): the fill-in of a pivot then stays next to it, so that the
@@ -24,13 +25,16 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import blas, lapack
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.errors import EvaluationError
 
 PIVOT_ZERO = 1e-13
 """Pivots (of scaled rows) below this are zero."""
+
+_UPPER, _TRANSPOSED = 0, 1
+"""Arguments ``lower`` and ``trans`` of ``dtrtrs``."""
 
 
 def cholesky(M: FloatArray) -> FloatArray:
@@ -58,7 +62,12 @@ def symmetric(M: FloatArray) -> FloatArray:
 
 def whiten(U: FloatArray, right: FloatArray) -> FloatArray:
     """L^-1 right = U^-T right, for ``right`` (n,) or (n, k)."""
-    return lapack.dtrtrs(U, right, trans=1)[0]  # type: ignore[no-any-return]
+    return lapack.dtrtrs(U, right, _UPPER, _TRANSPOSED)[0]  # type: ignore[no-any-return]
+
+
+def _whiten_in_place(U: FloatArray, right: FloatArray) -> None:
+    """As :func:`whiten`, for ``right`` (n, k) in Fortran's order, which it replaces."""
+    lapack.dtrtrs(U, right, _UPPER, _TRANSPOSED, 0, len(U), 1)
 
 
 def unwhiten(U: FloatArray, right: FloatArray) -> FloatArray:
@@ -199,6 +208,17 @@ class Projection:
         self.rank = rank
         self.rank_deficient = False
         self.held: FloatArray | None = None
+        self._allocate(0, 0)
+
+    def _allocate(self, m: int, nv: int) -> None:
+        """Workspace of :meth:`factor` for m rows: (G, f), which becomes (W, L^-1 f) in place, and
+        gamma with a number before it, because LAPACK counts rows from 1."""
+        right = np.empty((m + 1, nv))
+        self._rows, self._force = right[:m], right[m]
+        self._white = right.T
+        self._W = self._white[:, :m]
+        self._one_before = np.zeros(m + 1)
+        self._gamma = self._one_before[1:]
 
     def factor(
         self,
@@ -214,30 +234,43 @@ class Projection:
         structural pivots.
         """
         self.factorisations += 1
+        m, nv = G.shape
+        if self._white.shape != (nv, m + 1):
+            self._allocate(m, nv)
+        self._rows[:] = G
+        self._force[:] = f
         self.U = cholesky(M)
-        W = whiten(self.U, G.T)
+        _whiten_in_place(self.U, self._white)
+        W, self.white_force = self._W, self._force
+        self._gamma[:] = blas.dgemv(1.0, W, self._force, 1.0, bias, trans=1)  # W^T L^-1 f + bias
         structural = self.structural_rank
         floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold * self.sigma_ref)
         if self._graph_order:
-            packed, permutation, tau, pivots = swept_qr(W, self._graph_order, structural, floor)
+            packed, order, tau, pivots = swept_qr(W, self._graph_order, structural, floor)
+            self._from_one, self._pivots = order + 1, pivots
+            smallest = float(pivots[:structural].min())
         else:
-            packed, permutation, tau, pivots = pivoted_qr(W)
-        self._pivots = pivots[:structural]
-        self.sigma = float(self._pivots.min()) / self.sigma_ref
+            packed, self._from_one, tau, _, _ = lapack.dgeqp3(W, 3 * (m + 1), 1)
+            smallest = abs(packed.item(structural - 1, structural - 1))
+        self.sigma = smallest / self.sigma_ref
         if not self.sigma >= 0.0:
             raise EvaluationError("the mass matrix or the closures are not finite")
         rank = structural
-        while rank > 0 and pivots[rank - 1] < floor:
+        while rank > 0 and abs(packed.item(rank - 1, rank - 1)) < floor:
             rank -= 1
         self.rank = rank
         self.rank_deficient = rank < structural
-        self.order: IndexArray = permutation[:rank]
-        self.R = packed[:rank, :rank]
-        self.Q = q_columns(packed, tau, rank)
+        if rank < m:
+            packed, tau, self._from_one = packed[:, :rank], tau[:rank], self._from_one[:rank]
+        self.R = packed
+        self.Q = lapack.dorgqr(packed, tau)[0] if rank else packed
         self.held = None
-        self.white_force = whiten(self.U, f)
-        gamma = W.T.dot(self.white_force) + bias
-        self.white_multiplier = self.normal(gamma[self.order])
+        self.white_multiplier = self._normal(self._one_before.take(self._from_one))
+
+    @property
+    def order(self) -> IndexArray:
+        """The rows in use (rank,), in the order of their pivots."""
+        return self._from_one - 1
 
     def hold(self, normals: FloatArray) -> None:
         """Keep the motion tangential to the last of ``normals`` (nv, k), which replace the dropped
@@ -251,6 +284,13 @@ class Projection:
             self.held.T @ (self.white_force - self.white_multiplier)
         )
 
+    def completed(self, white: FloatArray, predicted: FloatArray) -> FloatArray:
+        """``white`` (nv,), L^T times a multiplier of the rows in use, and of ``predicted`` (nv,), a
+        whole multiplier, the part of the dropped rows: L^T (1 - P) predicted."""
+        prediction = self.U @ predicted
+        out: FloatArray = white + prediction - self.Q @ (self.Q.T @ prediction)
+        return out
+
     def normals(self) -> FloatArray:
         """L^-T Q (nv, rank): M-orthonormal normals of the rows in use, the weakest last."""
         if not self._graph_order:
@@ -262,8 +302,12 @@ class Projection:
         """Orthonormal white vectors (nv, nv - rank), orthogonal to the rows in use."""
         return np.linalg.qr(self.Q, mode="complete")[0][:, self.rank :]
 
-    def normal(self, right: FloatArray) -> FloatArray:
-        """Q R^-T right (nv,) for ``right`` (rank,) in pivot order: L^T E applied to it."""
+    def normal(self, rows: FloatArray) -> FloatArray:
+        """L^T E rows (nv,) for errors ``rows`` (m,)."""
+        return self._normal(rows[self._from_one - 1])
+
+    def _normal(self, right: FloatArray) -> FloatArray:
+        """Q R^-T right (nv,) for ``right`` (rank,) in pivot order."""
         if self.rank == 0:
             return np.zeros(self.U.shape[0])
         return self.Q.dot(whiten(self.R, right))  # type: ignore[no-any-return]

@@ -28,7 +28,7 @@ body that is at x.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from copy import copy
 from typing import Any, NamedTuple, Self
 
@@ -343,7 +343,8 @@ class _LoopRows:
             bias = to_world(Ra, plus_cross(bias, spin, speed))
             if ground:
                 bias = minus(bias, b.bias())  # the ground's is -gravity, as in every body's
-                r = to_world(Ra, speed)
+                if self._distances:
+                    r = to_world(Ra, speed)
             else:
                 spin = b.spin()
                 sx, sy, sz = from_world(Rb, to_world(Ra, speed))
@@ -469,8 +470,11 @@ class LoopKinematics:
         m = len(self._support)
         self._numbers = np.zeros(8 * m)
         table = self._numbers.reshape(m, 8)
-        self._wrenches, self.g, self.bias = table[:, :6], table[:, 6], table[:, 7]
+        self.g, self.bias = table[:, 6], table[:, 7]
         self.G = np.zeros(self._support.shape)
+        self._is_masked = bool((self._support != 1.0).any())
+        self._wrenches, self._anchored_G = table[: self._anchored, :6], self.G[: self._anchored]
+        self._joint_rows = [rows for rows in self._loops if isinstance(rows, _JointRows)]
         self.target_rate = np.zeros(m)
         self._data: pin.Data | None = None
 
@@ -518,10 +522,6 @@ class LoopKinematics:
         """Whether G is constant: all rows are linear relations of joint coordinates."""
         return not self._anchored and all(rows.is_constant for rows in self._joint_rows)
 
-    @property
-    def _joint_rows(self) -> Iterator[_JointRows]:
-        return (rows for rows in self._loops if isinstance(rows, _JointRows))
-
     def pattern(self) -> BoolArray:
         """Which entries of G (m, nv) may differ from zero."""
         out: BoolArray = self._support != 0.0
@@ -560,9 +560,10 @@ class LoopKinematics:
         for loop in self._loops:
             loop.evaluate(q, v, numbers)
         self._numbers[:] = numbers
-        G, anchored = self.G, slice(self._anchored)
-        np.dot(self._wrenches[anchored], self._J, G[anchored])
-        np.multiply(G, self._support, G)
+        G = self.G
+        np.dot(self._wrenches, self._J, self._anchored_G)
+        if self._is_masked:
+            np.multiply(G, self._support, G)
         for rows in self._joint_rows:
             G[rows.first_row : rows.first_row + rows.count] = rows.G
         for row, other, factor in self._eliminations:

@@ -35,6 +35,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -120,7 +121,7 @@ def linearised(
     return Linearisation(rate, J, by_time, applied, laws, by_coordinates, by_laws)
 
 
-class LinearStages(Stages):
+class LinearStages:
     """The stages of one linearly implicit step.
 
     Parameters
@@ -140,6 +141,7 @@ class LinearStages(Stages):
     ) -> None:
         self._system, self._rate_of, self._apply = system, rate_of, apply
         self.stiffness = stiffness
+        self.laws: FloatArray | None = None
 
     def begin(self, j: int) -> None:
         """See :class:`Stages`."""
@@ -237,7 +239,7 @@ class SwitchingStep(SplitStep):
     def _stepper(self, stiff: bool) -> SplitStep:
         return LinearSplitStep(self.scheme.member(True), self.eps) if stiff else self._explicit
 
-    @property
+    @cached_property
     def _explicit(self) -> SplitStep:
         return SplitStep(self.scheme, self.eps)
 

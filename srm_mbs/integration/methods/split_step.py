@@ -20,6 +20,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 
@@ -46,8 +47,8 @@ RESIDUAL_EVERY = 16
 """Steps, after the first RESIDUAL_EVERY, from one look at all closure rows to the next."""
 
 
-class Stages:
-    """How the rates of a scheme follow from the chart rates of its stages: they are the same.
+class Stages(Protocol):
+    """How the rates of a scheme follow from the chart rates of its stages.
 
     Attributes
     ----------
@@ -57,15 +58,14 @@ class Stages:
         Laws of forces at the stage begun last, if the scheme carries them.
     """
 
-    stiffness: float = np.nan
-    laws: FloatArray | None = None
+    stiffness: float
+    laws: FloatArray | None
 
     def begin(self, j: int) -> None:
         """Prepare the system for the stage ``j``."""
 
     def rate(self, j: int, rate: FloatArray) -> FloatArray:
         """The rate (n,) of the stage ``j`` in the scheme, from the chart rate."""
-        return rate
 
 
 @lru_cache(maxsize=64)
@@ -105,10 +105,11 @@ class SplitStep:
         norm: ErrorNorm,
         zone: Zone | None,
         rates: FloatArray,
-    ) -> Stages:
-        """The stages of one step; ``rates`` (s + 1, n) receives the rates of those at its start."""
+    ) -> Stages | None:
+        """The stages of one step, None where the rates of the scheme are the chart rates; ``rates``
+        (s + 1, n) receives those at its start."""
         rates[0] = memory.rate
-        return Stages()
+        return None
 
     def start(
         self, system: System, t: float, state: FloatArray, norm: ErrorNorm
@@ -160,7 +161,8 @@ class SplitStep:
         for j, stage_weights, fraction in zip(range(first, s + 1), h * all_weights, fractions):
             before, delta = delta, stage_weights.dot(weighed)
             x = system.retract(state, delta)
-            stages.begin(j)
+            if stages is not None:
+                stages.begin(j)
             time = t + fraction * h
             terms = system.evaluate(time, x, zone if nodes is None else None)
             all_sigmas.append(terms.sigma)
@@ -175,8 +177,9 @@ class SplitStep:
             if branch is not None:
                 terms, x, moved = branch(terms, time, fraction, x)
             rate = terms.rate()
-            chart_rate = system.chart_rate(delta, rate)
-            rates[j] = chart_rate if j == s else stages.rate(j, chart_rate)
+            rates[j] = chart_rate = system.chart_rate(delta, rate)
+            if stages is not None and j < s:
+                rates[j] = stages.rate(j, chart_rate)
             if terms.rank_deficient:
                 deficient.append((j, terms.rank, terms.held))
         sigma = all_sigmas[-1]
@@ -220,9 +223,9 @@ class SplitStep:
             state_scale=state_scale,
             multiplier=multiplier,
             stiff=memory.stiff,
-            stiffness=stages.stiffness,
-            laws=stages.laws,
         )
+        if stages is not None:
+            result.stiffness, result.laws = stages.stiffness, stages.laws
         direct_from = BRANCH_SIGMA if nodes is not None and nodes.used else 0.0
         result.error_ratio = self._error_ratio(
             system, memory, norm, result, branch, deficient, direct_from
@@ -308,7 +311,7 @@ class SplitStep:
             explicit = True
             change_of_rate = result.rates[-1] - result.rates[-2]
             stiffness = stiffness_of(system, h, last_motion, change_of_rate)
-        if explicit or scheme.implicit is not None:
+        if (explicit or scheme.implicit is not None) and len(system.friction_sums):
             k = system.multiplier_part.start
             v = np.array([memory.rate[:k], result.end_rate[:k]])
             weights = norm.weights(memory.state_scale)[k:]

@@ -66,8 +66,6 @@ def chatters(
     sums : (n, k)
         The rates that have friction, as sums of v.
     """
-    if not len(sums):
-        return False
     change = h * np.ptp(accelerations @ sums.T, axis=0)
     sizes = np.maximum(np.abs(v @ sums.T).max(axis=0), np.abs(sums) @ weights)
     return bool((change > sizes).any())

@@ -72,9 +72,7 @@ class Problem:
 def matrices(p: Projection, m: int) -> tuple[FloatArray, FloatArray]:
     """E (nv, m) and P (nv, nv) as dense matrices; rows outside the rank have no column in E."""
     nv = len(p.U)
-    E = np.zeros((nv, m))
-    for k, row in enumerate(p.order):
-        E[:, row] = p.unwhiten(p.normal(np.eye(p.rank)[k]))
+    E = np.array([p.unwhiten(p.normal(row)) for row in np.eye(m)]).T
     P = np.array([p.project(w) for w in np.eye(nv)]).T
     return E, P
 

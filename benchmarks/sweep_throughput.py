@@ -1,16 +1,18 @@
 """Runs per second of a sweep against the number of workers.
 
     python -m benchmarks.sweep_throughput [--seconds 2] [--repeats 3] [--workers 1 2] [--json FILE]
+    python -m benchmarks.sweep_throughput --short 10000 [--repeats 3] [--workers 2] [--json FILE]
     python -m benchmarks.sweep_throughput --variants 500 [--backend generated] [--repeats 3]
         [--workers 2] [--json FILE]
 
 Run from a checkout; BLAS runs on one thread.  Initial speeds of a four-bar are swept, with short
-runs and long ones; or, with `--variants`, the crank of Klann's walker: each case makes a variant of
-the mechanism, simulates 2 s, and measures the reactions of all its joints.  Every executor has to
-give the rows of the serial sweep, to the last bit; of variants, Dask with processes is among them.
-Workers have been started, and have run, before the clock is.  The repeats go through all executors
-in turn, and the best of each counts; `--seconds` is about what one takes serially.  CPU time over
-wall time, of this process, says on a busy machine whether threads run beside each other.
+runs and long ones; with `--short` those of the slider-crank, with runs of 1 s; or, with
+`--variants`, the crank of Klann's walker: each case makes a variant of the mechanism, simulates
+2 s, and measures the reactions of all its joints.  Every executor has to give the rows of the
+serial sweep, to the last bit; of variants, Dask with processes is among them.  Workers have been
+started, and have run, before the clock is.  The repeats go through all executors in turn, and the
+best of each counts; `--seconds` is about what one takes serially.  CPU time over wall time, of this
+process, says on a busy machine whether threads run beside each other.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import json
 import os
 import time
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -37,9 +39,8 @@ from srm_mbs.formats.load import models_folder
 
 LENGTHS = (1.0, 10.0, 60.0)
 """Ends of the runs, s."""
-CHUNK = 8
-VARIANT_CHUNK = 16
-"""Variants that a worker process makes at a time."""
+WARM_UP = 64
+"""Cases of the sweep with which workers start."""
 VARIANT_END = 2.0
 """End of the runs of variants, s."""
 CRANKS = (0.262, 0.274)
@@ -57,7 +58,7 @@ class Row:
     t_end: float
     executor: str
     workers: int
-    chunk: int
+    chunk: int | None
     cases: int
     runs_per_second: float
     of_serial: float
@@ -102,15 +103,19 @@ def same(sweep: srm.Sweep, reference: srm.Sweep) -> bool:
     )
 
 
-def executors(stack: ExitStack, workers: list[int]) -> list[tuple[str, int, int, Executor | None]]:
-    """Name, workers, chunk and executor of each row."""
-    out: list[tuple[str, int, int, Executor | None]] = [("serial", 1, 1, None)]
+Measured = tuple[str, int, int | None, Executor | None]
+"""Name, workers, chunk (None: adaptive) and executor of a row."""
+
+
+def executors(stack: ExitStack, workers: list[int]) -> list[Measured]:
+    """The rows of sweeps over starts."""
+    out: list[Measured] = [("serial", 1, 1, None)]
     for count in workers:
         threads = stack.enter_context(ThreadPoolExecutor(count))
-        out.append(("threads", count, 1, threads))
+        out.append(("threads", count, None, threads))
     for count in workers:
         processes = stack.enter_context(ProcessPoolExecutor(count, mp_context=get_context("spawn")))
-        out += [("processes", count, chunk, processes) for chunk in (1, CHUNK)]
+        out += [("processes", count, chunk, processes) for chunk in (None, 1)]
     return out
 
 
@@ -138,7 +143,7 @@ def measure_variants(count: int, repeats: int, workers: list[int], backend: str)
     mechanism = klann()
     cranks = np.linspace(*CRANKS, count)
 
-    def run(executor: Executor | None, chunk: int, values: Any = cranks) -> srm.Sweep:
+    def run(executor: Executor | None, chunk: int | None, values: Any = cranks) -> srm.Sweep:
         return srm.sweep(
             mechanism,
             None,
@@ -151,18 +156,18 @@ def measure_variants(count: int, repeats: int, workers: list[int], backend: str)
         )
 
     with ExitStack() as stack:
-        rows: list[tuple[str, int, int, Executor | None]] = [("serial", 1, 1, None)]
+        rows: list[Measured] = [("serial", 1, 1, None)]
         for number in workers:
             threads = stack.enter_context(ThreadPoolExecutor(number))
             processes = ProcessPoolExecutor(number, mp_context=get_context("spawn"))
             rows += [
-                ("threads", number, 1, threads),
-                ("processes", number, VARIANT_CHUNK, stack.enter_context(processes)),
-                ("dask", number, VARIANT_CHUNK, with_dask(stack, number)),
+                ("threads", number, None, threads),
+                ("processes", number, None, stack.enter_context(processes)),
+                ("dask", number, None, with_dask(stack, number)),
             ]
         reference = run(None, 1)
         for *_, chunk, executor in rows[1:]:
-            run(executor, chunk, cranks[: 4 * VARIANT_CHUNK])
+            run(executor, chunk, cranks[:WARM_UP])
         return best_of(
             rows,
             VARIANT_END,
@@ -174,12 +179,12 @@ def measure_variants(count: int, repeats: int, workers: list[int], backend: str)
 
 
 def best_of(
-    rows: list[tuple[str, int, int, Executor | None]],
+    rows: list[Measured],
     t_end: float,
     count: int,
     repeats: int,
     reference: srm.Sweep,
-    run: Callable[[Executor | None, int], srm.Sweep],
+    run: Callable[[Executor | None, int | None], srm.Sweep],
 ) -> list[Row]:
     """The best of the ``repeats`` of each executor, in turn, all with the rows of the reference."""
     best = [(np.inf, 0.0)] * len(rows)
@@ -204,25 +209,46 @@ def best_of(
     ]
 
 
-def measure(t_end: float, seconds: float, repeats: int, workers: list[int]) -> list[Row]:
-    mechanism = srm.load("four_bar")
+def measure(
+    t_end: float,
+    seconds: float,
+    repeats: int,
+    workers: list[int],
+    name: str = "four_bar",
+    count: int | None = None,
+) -> list[Row]:
+    """Throughput of runs of a bundled mechanism; ``count`` of them, or as many as take ``seconds``
+    serially."""
+    mechanism = srm.load(name)
 
-    def run(count: int, executor: Executor | None, chunk: int = 1) -> srm.Sweep:
+    def run(count: int, executor: Executor | None, chunk: int | None = None) -> srm.Sweep:
         return srm.sweep(
             mechanism, cases(mechanism, count), t_end, executor=executor, chunk=chunk, rtol=1e-8
         )
 
     run(4, None)
     took, *_ = timed(lambda: run(4, None))
-    count = max(4 * CHUNK, int(4 * seconds / took))
+    count = count or max(WARM_UP, int(4 * seconds / took))
     reference = run(count, None)
     with ExitStack() as stack:
         rows = executors(stack, workers)
         for *_, chunk, executor in rows:
-            run(4 * CHUNK, executor, chunk)
+            run(WARM_UP, executor, chunk)
         return best_of(
             rows, t_end, count, repeats, reference, lambda e, chunk: run(count, e, chunk)
         )
+
+
+def tables(arguments: argparse.Namespace) -> Iterator[list[Row]]:
+    """The measurements that were asked for, one after the other."""
+    repeats, workers = arguments.repeats, arguments.workers
+    if arguments.variants:
+        yield measure_variants(arguments.variants, repeats, workers, arguments.backend)
+    elif arguments.short:
+        yield measure(1.0, 0.0, repeats, workers, "slider_crank", arguments.short)
+    else:
+        for t_end in LENGTHS:
+            yield measure(t_end, arguments.seconds, repeats, workers)
 
 
 def main() -> None:
@@ -230,6 +256,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--short", type=int, help="runs of 1 s of the slider-crank")
     parser.add_argument("--variants", type=int)
     parser.add_argument("--backend", default="kernel", help="of the runs of variants")
     parser.add_argument("--json", type=Path)
@@ -240,18 +267,13 @@ def main() -> None:
     print("| run (s) | executor | workers | chunk | cases | runs/s | of serial | CPU / wall |")
     print("|---|---|---|---|---|---|---|---|")
     rows = []
-    for t_end in (VARIANT_END,) if arguments.variants else LENGTHS:
-        for row in (
-            measure_variants(
-                arguments.variants, arguments.repeats, arguments.workers, arguments.backend
-            )
-            if arguments.variants
-            else measure(t_end, arguments.seconds, arguments.repeats, arguments.workers)
-        ):
+    for found in tables(arguments):
+        for row in found:
             rows.append(row)
             busy = "" if row.busy is None else f"{row.busy:.2f}"
+            chunk = "" if row.chunk is None else row.chunk
             print(
-                f"| {row.t_end:g} | {row.executor} | {row.workers} | {row.chunk} | {row.cases} "
+                f"| {row.t_end:g} | {row.executor} | {row.workers} | {chunk} | {row.cases} "
                 f"| {row.runs_per_second:.1f} | {row.of_serial:.2f} | {busy} |",
                 flush=True,
             )

@@ -7,7 +7,7 @@ Nothing here uses them.
 from __future__ import annotations
 
 import threading
-from typing import Any
+from typing import NamedTuple
 
 import pinocchio as pin
 
@@ -32,6 +32,25 @@ def workspace(model: pin.Model) -> pin.Data:
 _latest = threading.local()
 
 
+class _Scratch(NamedTuple):
+    """The workspace of :func:`scratch`.
+
+    Attributes
+    ----------
+    model, joints
+        The model for which it was asked last, and its joints then.
+    data
+        The workspace.
+    origin
+        The model for which it was made, or of which that is a copy (:func:`share_scratch`).
+    """
+
+    model: pin.Model
+    joints: int
+    data: pin.Data
+    origin: pin.Model
+
+
 def scratch(model: pin.Model) -> pin.Data:
     """A :func:`workspace` for one evaluation: the next call for ``model`` in this thread may return
     the same one, so that nothing may refer to its arrays any longer then.
@@ -40,7 +59,22 @@ def scratch(model: pin.Model) -> pin.Data:
     """
     if model.nv > LARGE:
         return workspace(model)
-    latest: tuple[Any, int, pin.Data] | None = getattr(_latest, "workspace", None)
-    if latest is None or latest[0] is not model or latest[1] != model.njoints:
-        latest = _latest.workspace = model, int(model.njoints), workspace(model)
-    return latest[2]
+    latest: _Scratch | None = getattr(_latest, "workspace", None)
+    if latest is None or latest.model is not model or latest.joints != model.njoints:
+        latest = _Scratch(model, int(model.njoints), workspace(model), model)
+        _latest.workspace = latest
+    return latest.data
+
+
+def share_scratch(origin: pin.Model, model: pin.Model) -> None:
+    """Let ``model``, a copy of ``origin`` with other placements and inertias, on which no workspace
+    depends, have the :func:`scratch` of ``origin`` or of another such copy."""
+    if model.nv > LARGE:
+        return
+    latest: _Scratch | None = getattr(_latest, "workspace", None)
+    joints = int(model.njoints)
+    if latest is not None and latest.origin is origin and latest.joints == joints:
+        data = latest.data
+    else:
+        data = workspace(model)
+    _latest.workspace = _Scratch(model, joints, data, origin)

@@ -77,6 +77,8 @@ class ClosureProblem(ClosureGeometry):
     configuration."""
 
     _latest: tuple[bytes, FloatArray, FloatArray, FloatArray] | None = None
+    _latest_mismatch: tuple[FloatArray, FloatArray] | None = None
+    """g of one of them, and the mismatch there."""
 
     def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As of every geometry, by the kernel where there is one; nothing may change the arrays."""
@@ -164,7 +166,12 @@ class ClosureProblem(ClosureGeometry):
     def mismatch(self, q: FloatArray) -> FloatArray:
         """Residual whose only zeros are the intended closed configurations: distances (in units)
         and differences of axes."""
-        return self._mismatch(self.closure(q)[0])
+        g = self.closure(q)[0]
+        if self._latest_mismatch is None or self._latest_mismatch[0] is not g:
+            found = self._mismatch(g)
+            found.setflags(write=False)
+            self._latest_mismatch = g, found
+        return self._latest_mismatch[1]
 
     def linearised(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """:meth:`mismatch`, and its derivative for motions of the joints in units (entries, nv)."""
@@ -228,7 +235,7 @@ class ClosureProblem(ClosureGeometry):
         turning = _periodic_coordinates(self.mechanism)
         indices = [
             (joint.idx_q + k, joint.idx_v + k)
-            for name, joint in zip(self.mechanism.joint_names, list(self.model.joints)[1:])
+            for name, joint in zip(self.mechanism.joint_names, self.model.joints.tolist()[1:])
             for k in range(joint.nv)
             if turning[joint.idx_v + k] and name not in coupled
         ]
@@ -401,12 +408,15 @@ def assemble_positions(problem: ClosureProblem, start: FloatArray, free: IndexAr
     """The closed configuration nearest to the guess ``start``, or the closest one to closed."""
     if not len(free):
         return start
-    rng = np.random.default_rng(0)
     together = len(problem.groups) == 1
+    rng: np.random.Generator | None = None  # most starts need none, and making one takes 20 us
 
     best, best_gap = start, float(np.linalg.norm(problem.mismatch(start)))
     for size in (0.0, *PERTURBATIONS):
-        spread = rng.uniform(-size, size, len(free)) if size else np.zeros(len(free))
+        spread = np.zeros(len(free))
+        if size:
+            rng = rng or np.random.default_rng(0)
+            spread = rng.uniform(-size, size, len(free))
         steps = RESTART_STEPS if size else SEARCH_STEPS if together else STEPS_TOGETHER
         q = close_positions(problem, problem.move(start, spread, free), free, steps)
         if problem.closed(q):
@@ -423,6 +433,7 @@ def assemble_positions(problem: ClosureProblem, start: FloatArray, free: IndexAr
     far = float(np.abs(away).max())
     if far > FAR:
         # Another branch may be nearer: look on the other side of the guess and around it.
+        rng = rng or np.random.default_rng(0)
         others = [-0.5 * away, -away]
         others += list(rng.uniform(-far, far, (OTHER_STARTS, len(free))))
         for other in others:

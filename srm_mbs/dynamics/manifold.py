@@ -153,7 +153,7 @@ def _groups(mechanism: MechanismData) -> tuple[GroupJoint, ...]:
 def _vector_coordinates(mechanism: MechanismData) -> IndexArray:
     """Index into q of each velocity component (nv,), -1 where q is not a vector space there."""
     index = np.full(mechanism.model.nv, -1)
-    for joint in list(mechanism.model.joints)[1:]:
+    for joint in mechanism.model.joints.tolist()[1:]:
         if joint.nq == joint.nv:
             index[joint.idx_v : joint.idx_v + joint.nv] = range(joint.idx_q, joint.idx_q + joint.nq)
     return index
@@ -162,7 +162,7 @@ def _vector_coordinates(mechanism: MechanismData) -> IndexArray:
 @per_model
 def _angle_pairs(mechanism: MechanismData) -> IndexArray:
     """Velocity indices of the joints whose angle is (cos, sin)."""
-    joints = list(mechanism.model.joints)[1:]
+    joints = mechanism.model.joints.tolist()[1:]
     return np.array([j.idx_v for j in joints if (j.nq, j.nv) == (2, 1)], dtype=int)
 
 
@@ -257,7 +257,7 @@ class Manifold:
     def position_norm(self, delta: FloatArray) -> float:
         """max |dq| over units; see :class:`~srm_mbs.dynamics.system.System`."""
         # A list: the largest of a few numbers, for which NumPy takes five times as long.
-        return max(map(abs, (delta[: self.nv] / self._unit).tolist()))
+        return float(max(map(abs, (delta[: self.nv] / self._unit).tolist())))
 
     def state_scale(self, state: FloatArray) -> FloatArray:
         """min(|q|, unit) per coordinate (the unit itself on a group), then |v|.
@@ -265,7 +265,8 @@ class Manifold:
         Angles are capped at 1 rad so that the accuracy does not decay with the number of turns.
         """
         if self._flat:
-            return np.minimum(np.abs(state), self._largest_scale)
+            out: FloatArray = np.minimum(np.abs(state), self._largest_scale)
+            return out
         q, v = self.split(state)
         position = self._unit.copy()
         vector = self._position_of >= 0

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -212,10 +213,8 @@ def scene_diagonal(mechanism: MechanismData, q: FloatArray) -> float:
 def _diagonal(mechanism: MechanismData, data: pin.Data) -> float:
     """:func:`scene_diagonal` at the placements of ``data``."""
     joints, points = _marked_points(mechanism)
-    places = list(data.oMi)
-    rotations = np.array([place.rotation for place in places])[joints]
-    origins = np.array([place.translation for place in places])[joints]
-    corners = origins + (rotations @ points[:, :, None])[:, :, 0]
+    places = np.array([place.homogeneous for place in data.oMi.tolist()])[joints]
+    corners = places[:, :3, 3] + (places[:, :3, :3] @ points[:, :, None])[:, :, 0]
     diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
     farthest = float(np.abs(corners).max())
     known_to = RELATIVE_ROUNDING * max(farthest, _gyration(mechanism))
@@ -225,17 +224,35 @@ def _diagonal(mechanism: MechanismData, data: pin.Data) -> float:
 @per_model
 def _gyration(mechanism: MechanismData) -> float:
     """The largest radius of gyration (m) of a body about its centre of mass."""
-    massive = [body for body in mechanism.model.inertias.tolist() if body.mass > 0.0]
-    # Lumping and shifting may round the trace of a point mass to a negative number.
-    squares = [max(body.inertia.trace(), 0.0) / body.mass for body in massive]
+    squares = [body.trace / body.mass for body in body_numbers(mechanism) if body.mass > 0.0]
     return float(np.sqrt(max(squares, default=0.0)))
+
+
+class BodyNumbers(NamedTuple):
+    """Mass (kg), centre of mass (3,) m in the axes of its joint, and trace of the inertia about it
+    (kg m^2) of a body."""
+
+    mass: float
+    lever: FloatArray
+    trace: float
+
+
+@per_model
+def body_numbers(mechanism: MechanismData) -> list[BodyNumbers]:
+    """Those of the bodies of all joints, the ground's first; the analyses of a load share them,
+    because Pinocchio takes a microsecond for each."""
+    return [
+        # Lumping and shifting may round the trace of a point mass to a negative number.
+        BodyNumbers(float(body.mass), body.lever.copy(), max(float(body.inertia.trace()), 0.0))
+        for body in mechanism.model.inertias.tolist()
+    ]
 
 
 @per_model
 def _marked_points(mechanism: MechanismData) -> tuple[IndexArray, FloatArray]:
     """Joints (k,) and points (k, 3) in their axes: the joints themselves, centres of mass, and
     anchors of closures."""
-    bodies = enumerate(islice(mechanism.model.inertias, 1, None), 1)
+    bodies = enumerate(islice(body_numbers(mechanism), 1, None), 1)
     found = [(joint, np.zeros(3)) for joint in range(1, mechanism.model.njoints)]
     found += [(joint, body.lever) for joint, body in bodies if body.mass > 0.0]
     found += anchor_points(mechanism)

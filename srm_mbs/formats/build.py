@@ -33,6 +33,7 @@ from srm_mbs.errors import (
 from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.plausibility import doubtful_angles, doubtful_inertias
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
+from srm_mbs.formats.translation import TreeParts
 from srm_mbs.formats.urdf.parser import UrdfModel, build_urdf, lock_joints
 from srm_mbs.formats.variants import Elements
 from srm_mbs.formats.xml import parse_xml
@@ -40,6 +41,7 @@ from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.coordinates import write_position, write_rate
 from srm_mbs.model.forces import ForceElement, Wrench
 from srm_mbs.model.mechanism import SimulationDefaults, Source, VariantMaker
+from srm_mbs.model.numbers import vector_elements
 from srm_mbs.model.validation import check_inertia, massless_ends, undetermined_joint
 
 log = get_logger(__name__)
@@ -60,7 +62,7 @@ def _acting_joints(description: Description) -> Iterator[tuple[str, str]]:
 def _check_joint_names(description: Description, model: pin.Model) -> None:
     """Refuse names that are no moving joints, and joints that are locked but act or are given
     twice."""
-    known = tuple(model.names)[1:]
+    known = tuple(vector_elements(model.names)[1:])
     initial = description.initial
     given = [("lock", name) for name in description.lock]
     for part in ("q", "v", "guess"):
@@ -141,8 +143,10 @@ def _with_massless_ends(
     """Treat massless moving ends as the description says: lock their joints, or give their bodies
     the inertia of a ball in ``model``; returns the description and notes."""
     treatment = description.massless
+    if treatment == "refused":
+        return description, ()
     ends = [k for k in massless_ends(model) if model.names[k] not in description.lock]
-    if treatment == "refused" or not ends:
+    if not ends:
         return description, ()
     names = [str(model.names[k]) for k in ends]
     if not isinstance(treatment, str):
@@ -196,7 +200,7 @@ class Reading:
         Reads it again with other values of its parameters; None without parameters.
     analysis
         That of another variant of the description, if it is one.
-    shape, model
+    parts, model
         As of :class:`~srm_mbs.formats.translation.Translation`.
     elements
         Its elements, where they are not made from the tables of the description.
@@ -211,7 +215,7 @@ class Reading:
     kind: type[Mechanism] = Mechanism
     variants: VariantMaker | None = None
     analysis: ReusableAnalysis | None = None
-    shape: tuple[Any, ...] = ()
+    parts: TreeParts | None = None
     model: pin.Model | None = None
     elements: Elements | None = None
 
@@ -238,20 +242,22 @@ def unassembled(
     description, massless = _with_massless_ends(description, built.model)
     _check_joint_names(description, built.model)
     model, q, v, guess = _without_locked(description, built.model)
-    check_inertia(model, source.urdf_path)
+    if reading.model is None:  # the start of variants decides
+        check_inertia(model, source.urdf_path)
     elements = reading.elements
     if elements is None:
         _check_frames(description, model)
     start = pin.neutral(model)
     for where, values in (("initial.guess", guess), ("initial.q", q)):
-        for name, value in values.items():
-            with naming(element=where):
+        with naming(element=where):
+            for name, value in values.items():
                 write_position(model.joints[model.getJointId(name)], start, name, value)
     for name, value in v.items():
         with naming(element="initial.v"):
             write_rate(model.joints[model.getJointId(name)], np.zeros(model.nv), name, value)
     defaults = description.simulation
-    csv = CsvFolder(Path(source.path).parent, source.reach) if tables else None
+    reads = tables and (description.force or description.drive)
+    csv = CsvFolder(Path(source.path).parent, source.reach) if reads else None
     friction_speed = description.friction_speed
     actuators, idle = description.named_actuators()
     forces = (
@@ -417,6 +423,27 @@ def _analysed(mechanism: Mechanism, reading: Reading) -> None:
     _ = mechanism.structure
 
 
+def _started(
+    mechanism: Mechanism, reading: Reading, q: Mapping[str, Any], v: Mapping[str, Any]
+) -> tuple[Mechanism, int | None]:
+    """The mechanism in a consistent start, and a joint that moves no inertia there.
+
+    Joints of a variant that all move inertia at the start do so elsewhere; whether others do is
+    looked at here, and comes before what else is wrong with them.
+    """
+    try:
+        found = consistent_start(mechanism, q, v).mechanism
+        started, joint = _with_rotors(found)
+        moves = joint is None and started is found
+    except (AssemblyError, EvaluationError):
+        if reading.model is not None:
+            check_inertia(mechanism.model, reading.source.urdf_path)
+        raise
+    if reading.model is not None and not moves:
+        check_inertia(mechanism.model, reading.source.urdf_path)
+    return started, joint
+
+
 def _with_doubts(mechanism: Mechanism, description: Description) -> Mechanism:
     """The mechanism with notes about values that look like those of other units, and about an axis
     that keeps a loop from moving; warnings say the same."""
@@ -459,7 +486,7 @@ def assembled(reading: Reading) -> Mechanism:
             if note:
                 mechanism = replace(reduced, notes=(*reduced.notes, note))
         # The mass matrix has to be regular before the analysis factorises it.
-        mechanism, joint = _with_rotors(consistent_start(mechanism, q, v).mechanism)
+        mechanism, joint = _started(mechanism, reading, q, v)
         if joint is None:
             _analysed(mechanism, reading)
     except AssemblyError as error:

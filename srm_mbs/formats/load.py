@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from numbers import Integral
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,10 @@ log = get_logger(__name__)
 
 GENERATED = re.compile(r"n_four_bar_([1-9][0-9]{0,8})\Z")
 """Names of generated mechanisms, with the number of loops."""
+
+
+KEPT_NAMES = 64
+"""Files whose URDFs have names already: variants are read from one file."""
 
 
 def models_folder() -> Path:
@@ -102,6 +106,12 @@ def _checked_base(base: Any) -> str:
     return base
 
 
+@lru_cache(maxsize=KEPT_NAMES)
+def _urdf_name(file: str) -> str:
+    """Name of the URDF that a translation of ``file`` makes."""
+    return Path(file).with_suffix(".urdf").name
+
+
 def _translated(
     own: Document,
     entries: Mapping[str, Any],
@@ -138,8 +148,7 @@ def _translated(
         translation = replace(translation, write=None)  # the text of the changed tree
         entries, as_read = without_overrides(entries), False
     if translation.entries or found.key != "urdf":
-        urdf_name = Path(model.file).with_suffix(".urdf").name
-        entries = merged(entries, translation.entries, urdf_name)
+        entries = merged(entries, translation.entries, _urdf_name(model.file))
         as_read = False
     elements = None
     if known is not None and translation.model is not None and not given:
@@ -170,7 +179,7 @@ def _translated(
         source,
         notes,
         translation.check,
-        shape=translation.shape,
+        parts=translation.parts,
         model=translation.model,
         elements=elements,
     )
@@ -181,20 +190,26 @@ def _of_description(
     overrides: Overrides,
     reach: Reach,
     urdf: str | None = None,
-    known: KnownLinkage | None = None,
+    origin: _Variants | None = None,
 ) -> Reading:
-    """Read a description; its model file is read from disk unless ``urdf`` is its text."""
+    """Read a description; its model file is read from disk unless ``urdf`` is its text.  A variant
+    has an ``origin``."""
     entries, values, notes = resolved(own.toml, overrides.parameters, own.file)
     given = own
     own = own if entries is own.toml else Document("", own.file)
     description = check_description(entries, own.file)
+    known = None if origin is None else origin.known
     reading, model = _of_tables(own, entries, description, overrides, reach, urdf, known)
-    return replace(
-        reading,
-        source=replace(reading.source, parameters=values),
-        notes=(*reading.notes, *notes),
-        variants=_Variants(given, overrides, reach, model) if values else None,
-    )
+    source = replace(reading.source, parameters=values)
+    notes = (*reading.notes, *notes)
+    if origin is not None:
+        further = replace(origin, overrides=overrides)
+        analysis, kind = origin.analysis, origin.kind
+        return replace(
+            reading, source=source, notes=notes, variants=further, analysis=analysis, kind=kind
+        )
+    variants = _Variants(given, overrides, reach, model) if values else None
+    return replace(reading, source=source, notes=notes, variants=variants)
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,9 +237,9 @@ class _Variants:
         values = {**self.overrides.parameters, **given_parameters(parameters)}
         with naming(file=self.own.file):
             overrides = replace(self.overrides, parameters=values)
-            reading = _of_description(self.own, overrides, self.reach, self.model, self.known)
-            mechanism = assembled(replace(reading, analysis=self.analysis, kind=self.kind))
-        variant_maker.keep(mechanism, replace(self, overrides=overrides))
+            reading = _of_description(self.own, overrides, self.reach, self.model, self)
+            mechanism = assembled(reading)
+        variant_maker.keep(mechanism, reading.variants)
         return mechanism
 
 
@@ -292,14 +307,14 @@ def _known_linkage(reading: Reading, mechanism: Mechanism) -> KnownLinkage | Non
     variants need the URDF itself."""
     description, model = reading.description, mechanism.model
     changed = description.lock or description.massless != "refused" or model.armature.any()
-    if not reading.shape or changed or description.gravity_compensation:
+    if reading.parts is None or changed or description.gravity_compensation:
         return None
-    tree = KnownTree(reading.shape, model)
+    tree = KnownTree(reading.parts, model)
     # Variants take over the rows of those that the mechanism has as they are described.
     kept = {loop.name: loop for loop in mechanism.loops}
     described = description.closures()
     closures = tuple(kept[one.name] if kept.get(one.name) == one else one for one in described)
-    return KnownLinkage(tree, description, reading.entries, closures)
+    return KnownLinkage(tree, description, reading.entries, closures, mechanism.points)
 
 
 def _of_file(path: Path, overrides: Overrides) -> Reading:

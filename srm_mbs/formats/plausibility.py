@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from typing import Any
 
 import pinocchio as pin
@@ -11,10 +12,12 @@ import pinocchio as pin
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import (
     anchor_points,
+    body_numbers,
     coordinate_units,
     is_angle,
     scene_diagonal,
 )
+from srm_mbs.model.numbers import vector_elements
 
 LARGEST_START = 4.0 * math.pi
 """Angle (rad) of a start above which it may be in degrees."""
@@ -49,14 +52,13 @@ def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:
     if scene == 1.0:
         scene = scene_diagonal(mechanism, mechanism.q0)
     sizes = [0.0] * model.njoints
-    parents, places = list(model.parents), list(model.jointPlacements)
+    parents, places = vector_elements(model.parents), model.jointPlacements.tolist()
     ends = [(parents[joint], places[joint].translation) for joint in range(1, model.njoints)]
     ends += anchor_points(mechanism)
     for joint, place in ends:
         sizes[joint] = max(sizes[joint], math.hypot(*place.tolist()))
-    for joint in range(1, model.njoints):
-        body = model.inertias[joint]
-        half_trace = 0.5 * max(sum(body.inertia.diagonal().tolist()), 0.0)
+    for joint, body in islice(enumerate(body_numbers(mechanism)), 1, None):
+        half_trace = 0.5 * body.trace
         if body.mass == 0.0:
             if half_trace > 0.0:
                 yield (

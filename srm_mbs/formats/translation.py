@@ -6,16 +6,17 @@ Every reader makes a :class:`Translation`; from there one path leads to the mech
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element, indent, tostring
 
 import pinocchio as pin
 
 from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.formats.graph.joint_graph import Body, Joint
 from srm_mbs.formats.toml.schema import PlanarEntry
 from srm_mbs.model.reach import Reach
 
@@ -51,19 +52,27 @@ class Options:
     known: KnownTree | None = None
 
 
+class TreeParts(NamedTuple):
+    """Bodies and joints of a tree, in order; every joint is where the frame of its child is, with
+    the axes of its parent."""
+
+    bodies: Sequence[Body]
+    joints: Sequence[Joint]
+
+
 @dataclass(frozen=True, eq=False)
 class KnownTree:
     """The tree of a mechanism, whose variants may have the same links and joints.
 
     Attributes
     ----------
-    shape
-        All of it but the numbers that variants change (:attr:`Translation.shape`).
+    parts
+        Its bodies and joints (:attr:`Translation.parts`).
     model
         Pinocchio's model.
     """
 
-    shape: tuple[Any, ...]
+    parts: TreeParts
     model: pin.Model
 
 
@@ -94,9 +103,9 @@ class Translation:
         The file that the URDF came from, if it is another one than that translated.
     check
         Raises InputError if the assembled mechanism cannot be what the file is meant to describe.
-    shape
-        All of the tree but the numbers that variants change, for :class:`KnownTree`; empty where
-        variants are built from their tree.
+    parts
+        The bodies and joints of the tree, for :class:`KnownTree`; None where variants are built
+        from their tree, or made from another.
     model
         Pinocchio's model, if it was made from that of a :class:`KnownTree`: ``tree`` is empty.
     """
@@ -107,7 +116,7 @@ class Translation:
     notes: tuple[str, ...] = ()
     urdf_file: str = ""
     check: Callable[[Mechanism], None] | None = None
-    shape: tuple[Any, ...] = ()
+    parts: TreeParts | None = None
     model: pin.Model | None = None
 
     def __post_init__(self) -> None:

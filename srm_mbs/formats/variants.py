@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 from srm_mbs.errors import InputError
@@ -35,18 +36,19 @@ class KnownLinkage:
         Its tree.
     description, entries
         Its checked description, translated, and the tables of this.
-    closures
-        Its closures.
+    closures, points
+        Its closures and named points.
     """
 
     tree: KnownTree
     description: Description
     entries: Mapping[str, Any]
     closures: tuple[LoopClosure, ...]
+    points: Mapping[str, Anchor]
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Without the description, whose tables have classes made at run time."""
-        return _checked_again, (self.tree, dict(self.entries), self.closures)
+        return _checked_again, (self.tree, dict(self.entries), self.closures, dict(self.points))
 
     def elements(self, entries: Mapping[str, Any]) -> Elements | None:
         """The elements of a variant with the translated tables ``entries``; None where more than
@@ -58,7 +60,7 @@ class KnownLinkage:
             return None
         try:
             closures = self._closures(entries.get("loop", []))
-            points = {name: Anchor(**at) for name, at in entries.get("points", {}).items()}
+            points = dict(self._points(entries.get("points", {})))
         except (InputError, TypeError):
             return None  # the check says what is wrong
         if closures is None:
@@ -67,6 +69,13 @@ class KnownLinkage:
         q, v, guess = (dict(parts.get(part, {})) for part in ("q", "v", "guess"))
         start = InitialEntry.model_construct(q=q, v=v, guess=guess)
         return Elements(self.description.model_copy(update={"initial": start}), closures, points)
+
+    def _points(self, tables: Mapping[str, Any]) -> Iterator[tuple[str, Anchor]]:
+        """Named points; those of the known ones that stay where they are, are the same."""
+        known = self.entries.get("points", {})
+        for name, at in tables.items():
+            same = name in self.points and known.get(name) == at
+            yield name, self.points[name] if same else Anchor(**at)
 
     def _closures(self, tables: list[dict[str, Any]]) -> tuple[LoopClosure, ...] | None:
         """Closures that differ in their places alone, no two of which are the same."""
@@ -86,12 +95,17 @@ class KnownLinkage:
                     return None
                 closure = closure.between(Anchor(**ends["a"]), Anchor(**ends["b"]))
             found.append(closure)
-        keys = [key.name for key in fields(LoopClosure) if key.name != "name"]
-        different = {tuple(getattr(one, key) for key in keys) for one in found}
+        different = {_all_but_name(one) for one in found}
         return tuple(found) if len(different) == len(found) else None
 
 
+_all_but_name = attrgetter(*(key.name for key in fields(LoopClosure) if key.name != "name"))
+
+
 def _checked_again(
-    tree: KnownTree, entries: dict[str, Any], closures: tuple[LoopClosure, ...]
+    tree: KnownTree,
+    entries: dict[str, Any],
+    closures: tuple[LoopClosure, ...],
+    points: dict[str, Anchor],
 ) -> KnownLinkage:
-    return KnownLinkage(tree, check_description(entries, ""), entries, closures)
+    return KnownLinkage(tree, check_description(entries, ""), entries, closures, points)

@@ -346,8 +346,8 @@ class StepData:
     def between_nodes(self) -> list[int]:
         """The steps, ascending, that are known by the states and rates at their ends alone: those
         with a stage in the zone, and those past a critical configuration."""
-        critical = (step for one in self.critical_ranges for step in range(*one))
-        return sorted({*self.zones, *critical})
+        critical = [step for one in self.critical_ranges for step in range(*one)]
+        return sorted({*self.zones, *critical}) if critical else sorted(self.zones)
 
     @cached_property
     def layers(self) -> FloatArray:

@@ -76,6 +76,15 @@ class Anchor:
         offset = pin.SE3(rotation, np.array(self.xyz))
         if self.link == WORLD:
             return 0, offset
+        frame = self._frame(model)
+        return int(frame.parentJoint), frame.placement * offset
+
+    def joint(self, model: pin.Model) -> int:
+        """The joint of :meth:`resolve`, which raises the same, without the placement."""
+        return 0 if self.link == WORLD else int(self._frame(model).parentJoint)
+
+    def _frame(self, model: pin.Model) -> Any:
+        """The frame of ``model`` that it is on."""
         body, missing = pin.FrameType.BODY, model.nframes
         if self.link is not None:
             index = model.getFrameId(self.link, body)
@@ -89,8 +98,7 @@ class Anchor:
             raise InputError(
                 f"there is no {kind} {safe_repr(self.where)}", remedy=known_names(sorted(names))
             )
-        frame = model.frames[index]
-        return int(frame.parentJoint), frame.placement * offset
+        return model.frames[index]
 
 
 def name_places(element: str, *anchors: Any) -> list[str]:
@@ -118,26 +126,28 @@ def _resolve(model: pin.Model, anchor: Anchor, element: str) -> tuple[int, pin.S
         raise
 
 
-def resolve_apart(
-    model: pin.Model, a: Anchor, b: Anchor, element: str
-) -> tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]:
-    """Both anchors of ``element`` as in :meth:`Anchor.resolve`, on two different bodies.
+def check_apart(model: pin.Model, a: Anchor, b: Anchor, element: str) -> None:
+    """Refuse anchors of ``element`` that are not on two different bodies of ``model``.
 
     Raises
     ------
     InputError
         If the model has no such link or frame, or both lie on the same body.
     """
-    at_a = _resolve(model, a, f"{element}, anchor a")
-    at_b = _resolve(model, b, f"{element}, anchor b")
-    if at_a[0] == at_b[0]:
+    joints = []
+    for anchor, side in ((a, "a"), (b, "b")):
+        try:
+            joints.append(anchor.joint(model))
+        except InputError as error:
+            error.element = f"{element}, anchor {side}"
+            raise
+    if joints[0] == joints[1]:
         raise InputError(
             "both anchors lie on the same body",
             element=element,
             remedy="Anchor it on two bodies that move relative to each other "
             "(locked and fixed joints join bodies)",
         )
-    return at_a, at_b
 
 
 def resolve_moving(

@@ -22,6 +22,7 @@ The fields of :class:`LoopClosure` are the one list of the keys of a closure: de
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -33,7 +34,7 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, safe_repr
-from srm_mbs.model.anchors import Anchor, name_places, one_degree_joint, resolve_apart
+from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
 from srm_mbs.model.numbers import checked_name, finite_number, finite_numbers, plain, unit_vector
 
 
@@ -392,10 +393,11 @@ class LoopClosure:
 
     def between(self, a: Anchor, b: Anchor) -> LoopClosure:
         """The same closure between other places."""
-        out = replace(self, a=a, b=b)
         if self.type != "distance" or self.length is not None:
-            # In the axes of the anchors, wherever these are.
-            object.__setattr__(out, "rows", self.rows)
+            _ = self.rows  # in the axes of the anchors, wherever these are: the copy has them, too
+        out = copy(self)
+        object.__setattr__(out, "a", a)
+        object.__setattr__(out, "b", b)
         return out
 
     @property
@@ -602,7 +604,7 @@ class LoopClosure:
         """
         if self.anchors:
             a, b = self.anchors
-            resolve_apart(model, a, b, self._element)
+            check_apart(model, a, b, self._element)
         for name in self.joints or ():
             instead = "Couple joints with one degree of freedom"
             joint = one_degree_joint(model, name, self._element, instead)

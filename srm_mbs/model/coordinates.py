@@ -8,6 +8,7 @@ planar joint; rates are linear then angular, in the moving body's frame.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -24,6 +25,8 @@ UNIT_LENGTH_TOLERANCE = 1e-3
 
 def _numbers(value: Any, name: str, accepted: dict[int, str]) -> FloatArray:
     """One number or a list of them as an array, of one of the accepted lengths."""
+    if type(value) is float and 1 in accepted and math.isfinite(value):
+        return np.array((value,))  # without the checks of what else users give
     array = finite_array(value)
     if array is None or array.ndim > 1 or array.size not in accepted:
         wanted = " or ".join(accepted.values())

@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs.errors import InputError, safe_repr
-from srm_mbs.model.anchors import Anchor, name_places, one_degree_joint, resolve_apart
+from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.laws import Curve, Law, Polynomial, Sine, Table
 from srm_mbs.model.numbers import checked_name, unit_vector
@@ -146,7 +146,7 @@ class Drive:
             Naming the drive and the remedy.
         """
         if self.a is not None and self.b is not None:
-            resolve_apart(model, self.a, self.b, self._element)
+            check_apart(model, self.a, self.b, self._element)
         else:
             instead = "Drive a point with a, b and axis, or model it with joints of one degree"
             one_degree_joint(model, self.joint, self._element, instead)

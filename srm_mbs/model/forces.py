@@ -24,10 +24,10 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.anchors import (
     Anchor,
+    check_apart,
     moving_joint,
     name_places,
     one_degree_joint,
-    resolve_apart,
     resolve_moving,
     turn_counting_joint,
 )
@@ -200,7 +200,7 @@ class _BetweenLinks(ForceElement):
         self._refuse_zeros("stiffness", "damping")
 
     def check(self, model: pin.Model) -> None:
-        resolve_apart(model, self.a, self.b, self._element)
+        check_apart(model, self.a, self.b, self._element)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive, positions
 from srm_mbs.model.forces import ForceElement
 from srm_mbs.model.laws import Curve, Law
-from srm_mbs.model.numbers import checked_name
+from srm_mbs.model.numbers import checked_name, vector_elements
 from srm_mbs.model.pinocchio_constraints import (
     PinocchioConstraints,
     closures_from_pinocchio,
@@ -240,6 +240,14 @@ def variant_maker(mechanism: MechanismData) -> VariantMaker | None:
     return None
 
 
+@per_model
+def variant_origin(mechanism: MechanismData) -> MechanismData | None:
+    """The mechanism of which this one was made by :meth:`MechanismData.with_parameters`, or of
+    which that one was: much of what follows from both may be the same, which users have to check.
+    None for others."""
+    return None
+
+
 FRICTION_SPEED = 0.01
 """Default of ``friction_speed``, rad/s or m/s."""
 
@@ -424,7 +432,9 @@ class MechanismData(ResultOwner):
                 remedy="Give srm.load a description with [parameters], and change the result after "
                 "with_parameters, not before",
             )
-        return make(values)  # type: ignore[no-any-return]
+        made: Self = make(values)
+        variant_origin.keep(made, variant_origin(self) or self)
+        return made
 
     @property
     def constrained(self) -> bool:
@@ -512,7 +522,7 @@ class MechanismData(ResultOwner):
 
 @per_model
 def _joint_names(mechanism: MechanismData) -> tuple[str, ...]:
-    return tuple(mechanism.model.names)[1:]
+    return tuple(vector_elements(mechanism.model.names)[1:])
 
 
 @per_model

@@ -46,6 +46,15 @@ def finite_array(
     return array
 
 
+def vector_elements(vector: Any) -> list[Any]:
+    """The elements of one of Pinocchio's vectors of numbers or names.
+
+    By index, because iterations over them end with an exception of C++, which takes three times as
+    long as the rest; vectors of objects have a quick ``tolist`` of their own.
+    """
+    return [vector[i] for i in range(len(vector))]
+
+
 def flag(value: Any, name: str) -> bool:
     """``value``, the argument ``name``, as a truth value.
 

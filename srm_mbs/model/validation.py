@@ -5,6 +5,7 @@ A tree must be in Pinocchio's order of joints, and its inertias must determine i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any, Protocol, TypeVar
@@ -17,7 +18,7 @@ from srm_mbs._kernel.workspace import scratch
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, known_names, naming, safe_repr
 from srm_mbs.model.anchors import Anchor
-from srm_mbs.model.numbers import finite_array, named_values
+from srm_mbs.model.numbers import finite_array, named_values, vector_elements
 
 ARTICULATED_INERTIA_TOLERANCE = 1e-13
 """Articulated inertia, over the composite one, below which it is rounding."""
@@ -83,7 +84,7 @@ def _motion(size: int) -> FloatArray:
 def massless_ends(model: pin.Model) -> list[int]:
     """The joints that move neither mass, inertia nor armature of their own, from the root to the
     tips."""
-    parents, moves = list(model.parents), [False] * model.njoints
+    parents, moves = vector_elements(model.parents), [False] * model.njoints
     for joint in range(model.njoints - 1, 0, -1):
         if moves[joint] or _has_inertia(model.inertias[joint]):
             moves[joint] = moves[parents[joint]] = True
@@ -123,7 +124,8 @@ def undetermined_joint(
         M = pin.crba(model, scratch(model), q)[::-1, ::-1]
         size = np.sqrt(M.diagonal())
         scaled = M / size[:, None] / size
-    if not np.isfinite(np.tril(M)).all():
+        finite = math.isfinite(np.add.reduce(M, axis=None))  # then each of them is
+    if not finite and not np.isfinite(np.tril(M)).all():
         raise InputError(
             "the mass matrix is not finite",
             file=file,
@@ -180,7 +182,7 @@ def check_tree(model: pin.Model) -> None:
 
 def _check_order(model: pin.Model) -> None:
     """Refuse joints out of order: Pinocchio's crba would return a wrong mass matrix, silently."""
-    parents, branch = list(model.parents), [0]
+    parents, branch = vector_elements(model.parents), [0]
     for joint in range(1, model.njoints):
         while branch and branch[-1] != parents[joint]:
             branch.pop()
@@ -317,8 +319,8 @@ def checked_points(model: pin.Model, points: Any) -> dict[str, Anchor]:
         Unless every name is a text and every point an anchor on a link or frame of the model.
     """
     found: dict[str, Anchor] = {}
+    links: set[str | None] = set()
     body = pin.FrameType.BODY
-    links = {frame.name for frame in model.frames if frame.type == body} if points else ()
     for name, anchor in named_values(points, "points").items():
         element = f"point {safe_repr(name)}"
         if not isinstance(name, str) or not isinstance(anchor, Anchor):
@@ -327,8 +329,10 @@ def checked_points(model: pin.Model, points: Any) -> dict[str, Anchor]:
                 element="points",
                 remedy='Give for example {"tip": srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))}',
             )
-        if anchor.link not in links:
-            with naming(element=element):
-                anchor.resolve(model)
+        if anchor.link is None or anchor.link not in links:
+            if anchor.link is None or not model.existFrame(anchor.link, body):
+                with naming(element=element):
+                    anchor.resolve(model)
+            links.add(anchor.link)
         found[name] = anchor
     return found

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import inspect
+import math
+import os
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
-from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -23,6 +25,7 @@ from srm_mbs.sweeps.results import Sweep
 from srm_mbs.sweeps.tasks import (
     Measure,
     Outcome,
+    Ran,
     Task,
     packed,
     raised,
@@ -34,6 +37,19 @@ log = get_logger(__name__)
 
 MAX_PENDING_CHUNKS = 512
 """Most chunks that are submitted at once: each has a copy of the mechanism."""
+LEAST_PENDING_CHUNKS = 16
+"""Chunks of adaptive length that are submitted at once, if there are so many: more than the workers
+of most executors, whose number no interface tells."""
+CHUNK_SECONDS = 0.05
+"""Time that a chunk of adaptive length is to take: sending one takes less than a hundredth of it,
+and a progress bar still moves."""
+LONGEST_CHUNK = 2.0
+"""Time of such a chunk, over ``CHUNK_SECONDS``, after which a worker begins no further case."""
+GROWTH = 4
+"""Largest ratio of the lengths of such a chunk and of the one that it follows from: the first run
+of a worker takes longer than others."""
+SHORTEST_TIME = 1e-6
+"""Time (s) of a chunk below which it is not measured."""
 _REFUSED_OPTIONS = {
     "q0": "Give it in the cases",
     "v0": "Give it in the cases",
@@ -51,7 +67,7 @@ def sweep(
     measure: Measure = standard_measures,
     options: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None,
     executor: Executor | None = None,
-    chunk: int = 1,
+    chunk: int | None = None,
     resume: str | Path | None = None,
     parameters: Mapping[str, Any] | None = None,
     progress: bool | Counted = False,
@@ -85,8 +101,9 @@ def sweep(
         Any executor with the interface of ``concurrent.futures``; by default the cases run
         sequentially in this thread.  Threads share the mechanism; processes get it pickled.
     chunk
-        Number of cases that a worker runs at a time, which are lost together if it dies.  More than
-        one is faster if a run takes less time than sending it.
+        Number of cases that a worker runs at a time, which are lost together if it dies.  By
+        default as many as take about 0.05 s, by what the last ones took: a worker that dies then
+        loses what it did in the last 0.1 s, and the case that it was at.
     resume
         A file to which every finished case is appended; the cases that it already has are read
         instead of being run.  Cases that raised an exception are repeated.
@@ -123,7 +140,7 @@ def sweep(
                 element=name,
                 remedy="Give a function",
             )
-    if not isinstance(chunk, int) or chunk < 1:
+    if chunk is not None and (not isinstance(chunk, int) or chunk < 1):
         raise InputError(
             f"chunk = {safe_repr(chunk)} is not a positive number of cases",
             element="chunk",
@@ -186,8 +203,59 @@ def _check_options(options: Mapping[str, Any]) -> None:
     mechanism_method(options.get("method", "psrm"), options.get("tableau"))
 
 
+class _Waiting:
+    """The cases that no worker has, in chunks.
+
+    Parameters
+    ----------
+    cases
+        All of them.
+    chunk
+        Number of cases in each; None: as many as a worker runs in about ``CHUNK_SECONDS``, by the
+        last chunk that was finished, and fewer towards the end, so that workers end together.
+    """
+
+    def __init__(self, cases: Sequence[Case], chunk: int | None) -> None:
+        self._cases = deque(cases)
+        self._chunk = chunk
+        self._size = 1
+        self._workers: set[tuple[str, int, int]] = set()
+        self.time_limit = math.inf if chunk is not None else LONGEST_CHUNK * CHUNK_SECONDS
+        """Seconds after which a worker returns what it has not begun."""
+
+    @property
+    def _parallel(self) -> int:
+        """Number of workers that there may be."""
+        return max(len(self._workers), os.cpu_count() or 1)
+
+    @property
+    def most_pending(self) -> int:
+        """Number of chunks that may be with the executor at once.  If their length adapts there are
+        few: one that each worker has, one that it takes next, and enough to find further workers.
+        """
+        return (
+            MAX_PENDING_CHUNKS
+            if self._chunk is not None
+            else min(MAX_PENDING_CHUNKS, max(LEAST_PENDING_CHUNKS, 2 * self._parallel))
+        )
+
+    def next_chunk(self) -> list[Case]:
+        """The next cases; none if there are no more."""
+        size = self._chunk
+        if size is None:
+            size = max(1, min(self._size, len(self._cases) // (2 * self._parallel)))
+        return [self._cases.popleft() for _ in range(min(size, len(self._cases)))]
+
+    def learn(self, sent: Sequence[Case], ran: Ran) -> None:
+        """Take back what a worker has not begun, and choose the length of the next chunks."""
+        self._workers.add(ran.worker)
+        self._cases.extendleft(reversed(sent[len(ran.outcomes) :]))
+        fitting = int(CHUNK_SECONDS * len(ran.outcomes) / max(ran.seconds, SHORTEST_TIME))
+        self._size = max(1, min(fitting, GROWTH * len(sent)))
+
+
 def _finished(
-    task: Task, cases: Sequence[Case], executor: Executor | None, chunk: int
+    task: Task, cases: Sequence[Case], executor: Executor | None, chunk: int | None
 ) -> Generator[tuple[Case, Outcome]]:
     """Yield each case with its outcome, as soon as it is known."""
     if executor is None:
@@ -195,34 +263,31 @@ def _finished(
             yield case, task.run(case.parameters)
         return
     sent = task if isinstance(executor, ThreadPoolExecutor) else packed(task)
-    chunks = iter([cases[k : k + chunk] for k in range(0, len(cases), chunk)])
-    running: dict[Future[list[Outcome]], Sequence[Case]] = {}
-    done: SimpleQueue[Future[list[Outcome]]] = SimpleQueue()
+    waiting = _Waiting(cases, chunk)
+    running: dict[Future[Ran], list[Case]] = {}
+    done: SimpleQueue[Future[Ran]] = SimpleQueue()
     try:
         while True:
-            more = list(islice(chunks, MAX_PENDING_CHUNKS - len(running)))
-            for part in more:
+            while len(running) < waiting.most_pending and (part := waiting.next_chunk()):
+                parameters = [case.parameters for case in part]
                 try:
-                    future = executor.submit(run_chunk, sent, [case.parameters for case in part])
+                    future = executor.submit(run_chunk, sent, parameters, waiting.time_limit)
                 except Exception as error:  # its workers have died, or it was shut down
                     yield from ((case, raised(error)) for case in part)
                 else:
                     running[future] = part
                     future.add_done_callback(done.put)
-            if running:
-                future = done.get()
-                part = running.pop(future)
-                yield from zip(part, _outcomes(future, len(part)))
-            elif not more:
+            if not running:
                 return
+            future = done.get()
+            part = running.pop(future)
+            try:
+                ran = future.result()
+            except Exception as error:  # its worker died: the same failure for all
+                yield from ((case, raised(error)) for case in part)
+            else:
+                waiting.learn(part, ran)
+                yield from zip(part, ran.outcomes)
     finally:
         for future in running:
             future.cancel()
-
-
-def _outcomes(future: Future[list[Outcome]], count: int) -> Sequence[Outcome]:
-    """The outcomes of a chunk of ``count`` cases; the same failure for all if its worker died."""
-    try:
-        return future.result()
-    except Exception as error:
-        return [raised(error)] * count

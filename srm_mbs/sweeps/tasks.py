@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+import os
 import pickle
+import platform
+import threading
+import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -202,7 +207,38 @@ def _unpacked(data: bytes) -> Task:
     return task
 
 
-def run_chunk(task: Task | bytes, chunk: Sequence[Mapping[str, Any]]) -> list[Outcome]:
-    """The outcomes of several cases, in order; this function is submitted to executors."""
+class Ran(NamedTuple):
+    """Outcomes of a chunk, from the worker that ran it.
+
+    Attributes
+    ----------
+    outcomes
+        Of its first cases, in order; of all of them unless the time limit ended it.
+    seconds
+        Time that they took.
+    worker
+        Host, process and thread.
+    """
+
+    outcomes: list[Outcome]
+    seconds: float
+    worker: tuple[str, int, int]
+
+
+def run_chunk(
+    task: Task | bytes, chunk: Sequence[Mapping[str, Any]], time_limit: float = math.inf
+) -> Ran:
+    """Run several cases one after the other; this function is submitted to executors.
+
+    No case begins once ``time_limit`` (s) has passed since the first did.
+    """
     known = _unpacked(task) if isinstance(task, bytes) else task
-    return [known.run(parameters) for parameters in chunk]
+    begin = time.perf_counter()
+    outcomes: list[Outcome] = []
+    seconds = 0.0
+    for parameters in chunk:
+        if outcomes and seconds > time_limit:
+            break
+        outcomes.append(known.run(parameters))
+        seconds = time.perf_counter() - begin
+    return Ran(outcomes, seconds, (platform.node(), os.getpid(), threading.get_ident()))

@@ -11,7 +11,7 @@ import os
 import pickle
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
@@ -63,9 +63,9 @@ def check_against_single_runs(sweep: srm.Sweep, mechanism: srm.Mechanism, t_end:
 
 
 @pytest.mark.parametrize("workers", ["none", "threads", "processes"])
-@pytest.mark.parametrize("chunk", [1, 2])
+@pytest.mark.parametrize("chunk", [None, 1, 2])
 def test_every_executor_gives_the_numbers_of_single_runs(
-    workers: str, chunk: int, four_bar: srm.Mechanism, request: pytest.FixtureRequest
+    workers: str, chunk: int | None, four_bar: srm.Mechanism, request: pytest.FixtureRequest
 ) -> None:
     with ThreadPoolExecutor(2) as threads:
         executor = {
@@ -101,6 +101,80 @@ class Backwards(Executor):
             for waiting, call in reversed(self._given):
                 waiting.set_result(call())
         return future
+
+
+class Recorded(ThreadPoolExecutor):
+    """Runs each chunk at once, and records how many cases it had and how many were run."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.chunks: list[tuple[int, int]] = []
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        ran = fn(*args, **kwargs)
+        self.chunks.append((len(args[1]), len(ran.outcomes)))
+        future.set_result(ran)
+        return future
+
+
+class Clock:
+    """A clock that only :meth:`wait` moves."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def wait(self, parameters: Any) -> dict[str, Any]:
+        """Let the time pass that a case is to take, as the function of its options."""
+        self.now += parameters["seconds"]
+        return {}
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    found = Clock()
+    monkeypatch.setattr("srm_mbs.sweeps.tasks.time.perf_counter", lambda: found.now)
+    return found
+
+
+def waited(seconds: Sequence[float], clock: Clock, **options: Any) -> Recorded:
+    """The chunks of a sweep over cases that take these times (s)."""
+    executor = Recorded()
+    cases = {"seconds": list(seconds)}
+    sweep = srm.sweep(
+        pendulum(),
+        cases,
+        1e-3,
+        measure=lambda solution: {},
+        options=clock.wait,
+        executor=executor,
+        **options,
+    )
+    assert sweep.table["seconds"].tolist() == cases["seconds"]
+    assert not sweep.failures
+    return executor
+
+
+def test_chunks_are_as_long_as_their_cases_are_short(clock: Clock) -> None:
+    short = waited([1e-3] * 2000, clock)
+    assert max(sent for sent, _ in short.chunks) == 50
+    assert short.chunks[-1][0] == 1  # workers end together
+    long = waited([0.2] * 20, clock)
+    assert set(long.chunks) == {(1, 1)}
+
+
+def test_a_worker_returns_the_cases_that_it_has_no_time_for(clock: Clock) -> None:
+    executor = waited([1e-3] * 1500 + [0.06] * 100, clock)
+    returned = [(sent, ran) for sent, ran in executor.chunks if ran < sent]
+    assert returned
+    assert all(ran >= 1 for _, ran in returned)
+    assert sum(ran for _, ran in executor.chunks) == 1600
+    assert max(sent for sent, _ in executor.chunks[-20:]) == 1
+
+
+def test_a_chunk_that_is_given_is_kept_however_long_its_cases_take(clock: Clock) -> None:
+    executor = waited([1.0] * 7, clock, chunk=3)
+    assert executor.chunks == [(3, 3), (3, 3), (1, 1)]
 
 
 def test_rows_keep_the_order_of_the_cases_whatever_finishes_first() -> None:
@@ -534,9 +608,9 @@ def test_throughput_is_measured_on_equal_rows() -> None:
     rows = throughput.measure(0.05, seconds=0.01, repeats=1, workers=[1])
     assert [(row.executor, row.chunk) for row in rows] == [
         ("serial", 1),
-        ("threads", 1),
+        ("threads", None),
+        ("processes", None),
         ("processes", 1),
-        ("processes", throughput.CHUNK),
     ]
     assert rows[0].of_serial == 1.0
     assert all(row.runs_per_second > 0.0 for row in rows)

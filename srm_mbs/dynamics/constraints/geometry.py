@@ -17,7 +17,7 @@ rows G of closures and drives lose rank on a motion, [G, -s'] does, because G v 
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,16 @@ CLEARLY_MORE = 1e-12
 cancelled terms, 1e-24 of which is rounding, is at most nv^3 in a mechanism at the origin."""
 OPEN_SAMPLES = 8
 """Random open configurations from which the usual norms of rows are measured."""
+KEPT_SPREADS = 16
+"""Sets of random motions that are kept, by the number of coordinates."""
+
+
+@lru_cache(maxsize=KEPT_SPREADS)
+def _spreads(size: int) -> FloatArray:
+    """Motions (n, size) to the open configurations, in units; read-only."""
+    out = np.random.default_rng(0).uniform(-np.pi, np.pi, (OPEN_SAMPLES, size))
+    out.setflags(write=False)
+    return out
 
 
 class ClosureGeometry:
@@ -98,7 +108,7 @@ class ClosureGeometry:
     @cached_property
     def commutes(self) -> bool:
         """Whether moves commute: no ball, planar or free joints."""
-        joints = list(self.model.joints)[1:]
+        joints = self.model.joints.tolist()[1:]
         return all(joint.nq == joint.nv or joint.nv == 1 for joint in joints)
 
     @cached_property
@@ -113,8 +123,8 @@ class ClosureGeometry:
     @cached_property
     def _open_configurations(self) -> FloatArray:
         """Open configurations (n, nq), from which usual norms are measured."""
-        rng, model = np.random.default_rng(0), self.model
-        spreads = rng.uniform(-np.pi, np.pi, (OPEN_SAMPLES, model.nv)) * self.coordinate_unit
+        model = self.model
+        spreads = _spreads(int(model.nv)) * self.coordinate_unit
         return np.array([pin.integrate(model, self.start, spread) for spread in spreads])
 
     def _jacobians(self, q: FloatArray) -> FloatArray:

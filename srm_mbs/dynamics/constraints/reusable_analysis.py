@@ -6,6 +6,8 @@ Whether it is valid for a variant is checked by a short walk from its start.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from statistics import median
 
 import numpy as np
 
@@ -19,8 +21,10 @@ from srm_mbs.dynamics.constraints.structure import (
     STRUCTURAL_PIVOT,
     ZERO_ROW,
     ManifoldSampler,
+    RandomSteps,
     Samples,
     Structure,
+    random_steps,
     row_names,
     rows_in_use,
     structure_of,
@@ -30,6 +34,8 @@ from srm_mbs.model.mechanism import MechanismData
 
 CHECKED_STEPS = 6
 """Closed configurations, beside the start, in which an analysis of a variant is checked."""
+KEPT_WALKS = 16
+"""Walks that are kept, by the number of coordinates."""
 SIMILAR = 4.0
 """Largest ratio of row norms, and of last pivots, of two mechanisms with one analysis."""
 
@@ -64,7 +70,7 @@ class ReusableAnalysis:
         walked = None if structure.notes else _walked(structure, mechanism)
         if walked is None:
             return None
-        last_pivot = float(np.median(walked.last_pivots(structure.rank)))
+        last_pivot = median(walked.last_pivots(structure.rank).tolist())
         rows, in_use = unscaled_rows(mechanism), rows_in_use(mechanism)
         return cls(structure, walked.largest, last_pivot, rows, in_use)
 
@@ -73,15 +79,20 @@ class ReusableAnalysis:
         rows with the places of its own closures, where these alone differ."""
         if mechanism.drives:
             return  # points that they move are anchors, too
-        rows = self.rows.moved(mechanism.model, mechanism.loops)
+        loops = mechanism.loops
+        if not all(loop.anchors for loop in loops):
+            return  # couplings have no places
+        rows = self.rows.moved(loops, [loop.resolve(mechanism.model) for loop in loops])
         if rows is not None:
             unscaled_rows.keep(mechanism, rows)
             anchor_points.keep(mechanism, rows.anchors())
 
     def lend_rows_in_use(self, mechanism: MechanismData) -> None:
-        """The same with the rows in use, for a variant that has this analysis."""
-        if not mechanism.drives:
-            rows = self.in_use.moved(mechanism.model, mechanism.loops)
+        """The same with the rows in use, for a variant that has this analysis and those of
+        :meth:`lend_rows`."""
+        unscaled = unscaled_rows.kept(mechanism)
+        if unscaled is not None and not mechanism.drives:
+            rows = self.in_use.moved(mechanism.loops, unscaled.places())
             if rows is not None:
                 rows_in_use.keep(mechanism, rows)
 
@@ -107,10 +118,20 @@ class ReusableAnalysis:
             return None
         used = structure.kept
         ratios = walked.largest[used] / self.lengths[used]
-        ratios = np.append(ratios, np.median(walked.last_pivots(structure.rank)) / self.last_pivot)
+        pivot = median(walked.last_pivots(structure.rank).tolist())
+        ratios = np.append(ratios, pivot / self.last_pivot)
         if not (ratios.min() > 1.0 / SIMILAR and ratios.max() < SIMILAR):
             return None
         return structure.at(mechanism)
+
+
+@lru_cache(maxsize=KEPT_WALKS)
+def _steps(nv: int) -> RandomSteps:
+    """The steps of the walk, the same for all mechanisms of ``nv`` coordinates; read-only."""
+    steps = random_steps(np.random.default_rng(0), CHECKED_STEPS, nv)
+    for array in steps:
+        array.setflags(write=False)
+    return steps
 
 
 def _walked(structure: Structure, mechanism: MechanismData) -> Samples | None:
@@ -122,8 +143,8 @@ def _walked(structure: Structure, mechanism: MechanismData) -> Samples | None:
     start, error = sampler.close(mechanism.q0, CLOSING_STEPS)
     if not rank or not error < CLOSED:
         return None
-    rng = np.random.default_rng(0)
-    samples = sampler.explore(start, rng, 1, CHECKED_STEPS, mechanism.v0, sample_start=True)
+    walk = [_steps(int(mechanism.model.nv))]
+    samples = sampler.explore_along(start, walk, mechanism.v0, sample_start=True)
     loops = int((samples.of_loops > STRUCTURAL_PIVOT).sum(axis=1).max())
     if int(samples.ranks().max()) != rank or loops != structure.loop_rank:
         return None

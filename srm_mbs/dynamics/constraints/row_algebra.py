@@ -44,6 +44,7 @@ from srm_mbs.dynamics.constraints.projection import (
     whiten,
 )
 from srm_mbs.errors import EvaluationError
+from srm_mbs.model.numbers import vector_elements
 
 GRAPH_ORDER_ABOVE = 64
 """Coordinates above which pivots are taken along the graph of the loops."""
@@ -81,6 +82,10 @@ LEAST_COMMON = 16
 """Number of loops that share a coordinate up to which the coordinate makes them neighbours."""
 
 
+KEPT_ORDERS = 32
+"""Patterns of which the order and the columns of rows are kept."""
+
+
 def graph_order(pattern: BoolArray, parents: Sequence[int]) -> tuple[int, ...]:
     """All rows along the graph of the loops; () for up to 64 coordinates, or if W is full.
 
@@ -96,7 +101,7 @@ def graph_order(pattern: BoolArray, parents: Sequence[int]) -> tuple[int, ...]:
     return _ordered(pattern.shape, np.packbits(pattern).tobytes(), tuple(parents))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=KEPT_ORDERS)
 def _ordered(shape: tuple[int, int], bits: bytes, parents: tuple[int, ...]) -> tuple[int, ...]:
     size = shape[0] * shape[1]
     pattern = np.unpackbits(np.frombuffer(bits, np.uint8), count=size).reshape(shape).astype(bool)
@@ -368,16 +373,24 @@ def _compiled(
 ) -> CompiledAlgebra:
     from srm_mbs._kernel import core
 
-    supports = [[j for j, used in enumerate(row) if used] for row in pattern.tolist()]
+    supports = _supports(pattern.shape, np.packbits(pattern).tobytes())
     return CompiledAlgebra(
         core.Algebra(list(parents), supports, list(order), PIVOT_SHARE, window, "auto")  # type: ignore[union-attr]
     )
 
 
+@lru_cache(maxsize=KEPT_ORDERS)
+def _supports(shape: tuple[int, int], bits: bytes) -> list[list[int]]:
+    """The columns of each row of a pattern, from its bits; nothing may change them.  Variants of a
+    mechanism have the same."""
+    entries = np.unpackbits(np.frombuffer(bits, dtype=np.uint8), count=shape[0] * shape[1])
+    return [np.flatnonzero(row).tolist() for row in entries.reshape(shape)]
+
+
 def coordinate_parents(model: pin.Model) -> list[int]:
     """The next coordinate to the root of each velocity component (nv,); -1 at the root."""
     parents = [-1] * int(model.nv)
-    bodies, starts, sizes = (list(each) for each in (model.parents, model.idx_vs, model.nvs))
+    bodies, starts, sizes = map(vector_elements, (model.parents, model.idx_vs, model.nvs))
     for i in range(1, model.njoints):
         parent = bodies[i]
         above = starts[parent] + sizes[parent] - 1 if parent else -1
@@ -388,7 +401,7 @@ def coordinate_parents(model: pin.Model) -> list[int]:
 
 def trees(model: pin.Model) -> list[slice]:
     """Velocity components of each tree that is rooted in the ground: the blocks of M."""
-    at, parents = list(model.idx_vs), list(model.parents)
+    at, parents = vector_elements(model.idx_vs), vector_elements(model.parents)
     starts = [at[i] for i in range(1, model.njoints) if not parents[i]]
     return [slice(a, b) for a, b in zip(starts, [*starts[1:], int(model.nv)])]
 

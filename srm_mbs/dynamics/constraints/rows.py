@@ -245,6 +245,10 @@ class _Body:
         self.spin_bias = bias.angular.tolist
 
 
+Places = tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]
+"""Joint, and placement in it, of both anchors of a closure."""
+
+
 class _LoopRows:
     """The kept, scaled rows of one closure between anchors, resolved against a model."""
 
@@ -296,13 +300,14 @@ class _LoopRows:
             "first_row": self.first_row,
         }
 
-    def moved(self, model: pin.Model, loop: LoopClosure) -> _LoopRows | None:
-        """The same rows between the places of ``loop``; None if these are on other bodies."""
-        other = copy(self)
-        other.name = loop.name
-        (joint_a, other.in_a), (joint_b, other.in_b) = loop.resolve(model)
-        if (joint_a, joint_b) != (self.joint_a, self.joint_b):
+    def moved(self, name: str, places: Places) -> _LoopRows | None:
+        """The same rows of a closure ``name`` between these places; None if they are on other
+        bodies."""
+        (joint_a, in_a), (joint_b, in_b) = places
+        if joint_a != self.joint_a or joint_b != self.joint_b:
             return None
+        other = copy(self)
+        other.name, other.in_a, other.in_b = name, in_a, in_b
         other._take_places()
         return other
 
@@ -354,9 +359,7 @@ class _LoopRows:
         p = minus(at_b, self._at_b)
         for d in self._d:
             e = d if ground else to_world(Rb, d)
-            out += e
-            out += cross3(x, e)
-            out += dot(d, p), dot(d, bias)
+            out += *e, *cross3(x, e), dot(d, p), dot(d, bias)
         for length, factor in self._distances:
             apart = math.sqrt(dot(p, p))
             if apart < COINCIDENT * length:
@@ -480,16 +483,16 @@ class LoopKinematics:
         other._allocate()
         return other
 
-    def moved(self, model: pin.Model, loops: Sequence[LoopClosure]) -> Self | None:
-        """The same rows with the places of ``loops`` in ``model``, a tree of the same bodies and
-        joints; None where more than places of anchors differs, or might."""
+    def moved(self, loops: Sequence[LoopClosure], places: Sequence[Places]) -> Self | None:
+        """The same rows of ``loops``, whose anchors are at ``places`` in a tree of the same bodies
+        and joints; None where more than these differs, or might."""
         sets = [loop.rows for loop in loops]
         known = self._row_sets
         if len(sets) != len(known) or any(a is not b for a, b in zip(sets, known)):
             return None
         found = [
-            rows.moved(model, loop) if isinstance(rows, _LoopRows) else None
-            for rows, loop in zip(self._loops, loops)
+            rows.moved(loop.name, own) if isinstance(rows, _LoopRows) else None
+            for rows, loop, own in zip(self._loops, loops, places)
         ]
         if len(found) != len(loops) or None in found:  # joint rows, and closures without any
             return None
@@ -498,13 +501,18 @@ class LoopKinematics:
         other._allocate()
         return other
 
+    def places(self) -> list[Places]:
+        """The places of all closures between anchors that have rows."""
+        return [
+            ((rows.joint_a, rows.in_a), (rows.joint_b, rows.in_b))
+            for rows in self._loops
+            if isinstance(rows, _LoopRows)
+        ]
+
     def anchors(self) -> list[tuple[int, FloatArray]]:
         """Joint, and origin (3,) in its axes, of the anchors of all closures that have rows."""
         return [
-            (joint, place.translation.copy())
-            for rows in self._loops
-            if isinstance(rows, _LoopRows)
-            for joint, place in ((rows.joint_a, rows.in_a), (rows.joint_b, rows.in_b))
+            (joint, place.translation.copy()) for ends in self.places() for joint, place in ends
         ]
 
     @property

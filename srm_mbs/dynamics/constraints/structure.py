@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -80,6 +81,22 @@ BALANCING_SAMPLES = 12
 """Closed configurations in which rows are measured against each other."""
 RANK_GAP = 1e3
 """Smallest ratio of the smallest structural to the largest redundant pivot without a warning."""
+
+
+class RandomSteps(NamedTuple):
+    """Directions (n, nv) and lengths (n,), in units, of the steps of a walk."""
+
+    directions: FloatArray
+    reaches: FloatArray
+
+
+def random_steps(rng: np.random.Generator, steps: int, nv: int) -> RandomSteps:
+    """Steps of one walk of ``nv`` coordinates."""
+    directions, reaches = np.empty((steps, nv)), np.empty(steps)
+    for k in range(steps):
+        rng.standard_normal(out=directions[k])
+        reaches[k] = WALK_AMPLITUDE * rng.uniform(0.2, 1.0)
+    return RandomSteps(directions, reaches)
 
 
 class ManifoldSampler:
@@ -369,18 +386,25 @@ class ManifoldSampler:
         The first steps of two of them go along the velocity ``first`` (nv,) and against it, unless
         it is zero.
         """
+        walks = (random_steps(rng, steps, int(self.model.nv)) for _ in range(restarts))
+        return self.explore_along(start, walks, first, sample_start=sample_start)
+
+    def explore_along(
+        self,
+        start: FloatArray,
+        walks: Iterable[RandomSteps],
+        first: FloatArray | None = None,
+        *,
+        sample_start: bool = False,
+    ) -> Samples:
+        """:meth:`explore` by walks that were drawn."""
         along = [] if first is None or not first.any() else [first, -first]
         compiled = self._compiled()
         parts = []
-        for restart in range(restarts):
-            directions, reaches = np.empty((steps, self.model.nv)), np.empty(steps)
-            for k in range(steps):
-                rng.standard_normal(out=directions[k])
-                reaches[k] = WALK_AMPLITUDE * rng.uniform(0.2, 1.0)
+        for restart, steps in enumerate(walks):
             draws = (
                 sample_start and restart == 0,
-                directions,
-                reaches,
+                *steps,
                 along[restart] if restart < len(along) else None,
             )
             found = None if compiled is None else compiled.walk(start, *draws)
@@ -439,6 +463,8 @@ class Samples:
         if not parts:
             nothing = np.zeros((0, 0))
             return cls([], nothing, nothing, np.zeros(rows))
+        if len(parts) == 1:
+            return parts[0]
         configurations = [q for part in parts for q in part.configurations]
         pivots = np.concatenate([part.pivots for part in parts])
         of_loops = np.concatenate([part.of_loops for part in parts])

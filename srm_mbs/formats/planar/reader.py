@@ -48,9 +48,10 @@ from srm_mbs.formats.planar.shapes import (
     pin_visual,
     rod,
     slender,
+    slender_body,
     turned,
 )
-from srm_mbs.formats.planar.variants import model_of_variant, shape_of
+from srm_mbs.formats.planar.variants import model_of_variant, plain_parts
 from srm_mbs.formats.toml.schema import PlanarEntry, PlanarSlider
 from srm_mbs.formats.translation import Options, Translation, urdf_text
 from srm_mbs.model.anchors import WORLD
@@ -59,6 +60,8 @@ HINGE_AXIS = (0.0, -1.0, 0.0)
 """Axis of all pins, in the axes of the world."""
 KEPT_GRAPHS = 64
 """Graphs of joints whose spanning trees are kept: variants of a linkage have the same."""
+UNTURNED = np.eye(3)
+"""Rotation of the frames of links against each other, as drawn."""
 WIDTH = 0.02
 """Width of a bar as it is drawn, over the size of the drawing."""
 LAW_VALUES: Mapping[str, tuple[str, ...]] = {
@@ -281,7 +284,7 @@ class _Linkage:
         return self._local_places[key]
 
     def _at(self, body: str, point: str) -> pin.SE3:
-        return pin.SE3(np.eye(3), in_space(self._local(body, point)))
+        return pin.SE3(UNTURNED, in_space(self._local(body, point)))
 
     def _anchor(self, body: str, point: str) -> dict[str, Any]:
         x, y = self._local(body, point).tolist()
@@ -327,15 +330,14 @@ class _Linkage:
             for name in drawing.points
         }
         bodies, joints = self._parts
-        shape = shape_of(bodies, joints)
-        model = model_of_variant(self.options.known, shape, bodies, joints)
+        model = model_of_variant(self.options.known, bodies, joints)
         return Translation(
             Element("robot") if model is not None else self._urdf(drawn=False),
             lambda: urdf_text(self._urdf(drawn=True)),
             entries,
             tuple(self._notes()),
             check=self._check,
-            shape=shape,
+            parts=plain_parts(bodies, joints) if model is None else None,
             model=model,
         )
 
@@ -359,13 +361,12 @@ class _Linkage:
 
     def _placed(self, joint: Joint) -> Joint:
         """A joint of the tree with its frame on the parent; that on the child is the link's."""
-        place = self._at(joint.parent, self._point(joint))
-        if joint.type == "revolute":
-            return replace(joint, in_parent=place, axis=HINGE_AXIS)
-        slider = self.drawing.sliders[joint.name]
-        x, y, z = self._line(slider)
-        axis = (x, y, z) if joint.child == slider.name else (-x, y, -z)
-        return replace(joint, in_parent=place, axis=axis)
+        place, axis = self._at(joint.parent, self._point(joint)), HINGE_AXIS
+        if joint.type != "revolute":
+            slider = self.drawing.sliders[joint.name]
+            x, y, z = self._line(slider)
+            axis = (x, y, z) if joint.child == slider.name else (-x, y, -z)
+        return Joint(joint.name, joint.type, joint.parent, joint.child, place, axis=axis)
 
     def _inertia(self, body: str) -> pin.Inertia | None:
         drawing = self.drawing
@@ -387,8 +388,7 @@ class _Linkage:
         if bar.centre is not None:
             place = drawing.unit * np.array(bar.centre)
             centre = drawing.on_body(body, place) - self.origins[body]
-        moment = mass * shape.tensor[1, 1] if bar.inertia is None else bar.inertia
-        return body_inertia(mass, centre, moment * shape.tensor / shape.tensor[1, 1])
+        return slender_body(shape, mass, centre, bar.inertia)
 
     # -- closures, forces, start ---------------------------------------------------------------
 

@@ -26,7 +26,8 @@ FIT_ITERATIONS = 100
 DIVERGED = 1e12
 """Coordinates over the largest of the lengths at which Newton's method has failed."""
 KEPT_SHAPES = 1024
-"""Bars whose slender bodies are kept: variants of a linkage have most of them in common."""
+"""Bars whose shapes, slender bodies and inertias are kept: variants of a linkage have most of them
+in common."""
 COLLINEAR = 1e-12
 """Distance of points from a line, over the size of the bar, that is rounding."""
 PALETTE = (
@@ -59,13 +60,22 @@ def direction_angle(vector: FloatArray) -> float:
 
 
 def own_axes(points: FloatArray) -> FloatArray:
-    """Points (n, 2) in axes that begin at the first of them, with x towards the second."""
+    """Points (n, 2) in axes that begin at the first of them, with x towards the second; nothing may
+    change the result, which is the same object for the same points."""
+    return _own_axes(points.shape, points.tobytes())
+
+
+@lru_cache(maxsize=KEPT_SHAPES)
+def _own_axes(shape: tuple[int, ...], numbers: bytes) -> FloatArray:
+    """:func:`own_axes` from the bytes of the points."""
+    points = np.frombuffer(numbers).reshape(shape)
     angle = direction_angle(points[1] - points[0])
     # With plain numbers, because NumPy takes ten times as long for so few.
     c, s = float(np.cos(-angle)), float(np.sin(-angle))
     along = (points - points[0]).tolist()
     out = np.array([[c * x - s * y, s * x + c * y] for x, y in along])
     out[np.abs(out) < COLLINEAR * np.abs(out).max()] = 0.0
+    out.setflags(write=False)
     return out
 
 
@@ -133,7 +143,7 @@ def outline(points: FloatArray) -> list[tuple[int, int]]:
     return list(zip(ring, [*ring[1:], ring[0]]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Slender:
     """Slender bars of 1 kg in all along the outline of points.
 
@@ -186,11 +196,34 @@ def _slender(shape: tuple[int, ...], numbers: bytes) -> Slender:
     return Slender(length, np.array([x, y]), tensor)
 
 
+def slender_body(
+    shape: Slender, mass: float, centre: FloatArray, moment: float | None
+) -> pin.Inertia:
+    """Inertia of a body of ``mass`` (kg) about its ``centre`` (2,): that of slender bars, scaled to
+    a ``moment`` (kg m^2) in the plane if there is one; nothing may change the result."""
+    return _slender_body(shape, float(mass), centre.tobytes(), moment)
+
+
+@lru_cache(maxsize=KEPT_SHAPES)
+def _slender_body(shape: Slender, mass: float, centre: bytes, moment: float | None) -> pin.Inertia:
+    """:func:`slender_body` from the bytes of the centre."""
+    turning = shape.tensor[1, 1]
+    moment = mass * turning if moment is None else moment
+    return body_inertia(mass, np.frombuffer(centre), moment * shape.tensor / turning)
+
+
 def body_inertia(mass: float, centre: FloatArray, tensor: FloatArray) -> pin.Inertia:
     """Inertia of a body of ``mass`` (kg) with its centre of mass at (x, y), from the tensor
-    (3, 3) about it (kg m^2)."""
-    out = pin.Inertia(mass, in_space(centre), np.zeros((3, 3)))
-    out.inertia = tensor  # unchecked here: the check of the tree does
+    (3, 3) about it (kg m^2); nothing may change the result, which is the same object for the same
+    body."""
+    return _body_inertia(float(mass), centre.tobytes(), tensor.tobytes())
+
+
+@lru_cache(maxsize=KEPT_SHAPES)
+def _body_inertia(mass: float, centre: bytes, tensor: bytes) -> pin.Inertia:
+    """:func:`body_inertia` from the bytes of the arrays."""
+    out = pin.Inertia(mass, in_space(np.frombuffer(centre)), np.zeros((3, 3)))
+    out.inertia = np.frombuffer(tensor).reshape((3, 3))  # unchecked: the check of the tree does
     return out
 
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
+from srm_mbs._kernel.workspace import share_scratch
 from srm_mbs.formats.graph.joint_graph import Body, Joint
 from srm_mbs.formats.graph.spanning_tree_to_urdf import is_identity
-from srm_mbs.formats.translation import KnownTree
+from srm_mbs.formats.translation import KnownTree, TreeParts
 from srm_mbs.formats.urdf.validation import doubtful_moments
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
@@ -24,63 +24,83 @@ KEPT_BODIES = 1024
 """Inertias that are kept: variants of a linkage have most of them in common."""
 
 
-def shape_of(bodies: Sequence[Body], joints: Sequence[Joint]) -> tuple[Any, ...]:
-    """All of a tree but the translations of its joints and the inertias of its bodies; empty where
-    the check of the tree would have a note or a fault about these."""
-    if not _plain(bodies, joints):
-        return ()
-    return (
-        tuple((body.name, body.inertia is None) for body in bodies),
-        tuple((one.name, one.type, one.parent, one.child, one.axis) for one in joints),
-    )
-
-
-def _plain(bodies: Sequence[Body], joints: Sequence[Joint]) -> bool:
-    """Whether the numbers of a tree are those of real bodies, and of sensible size."""
+def plain_parts(bodies: Sequence[Body], joints: Sequence[Joint]) -> TreeParts | None:
+    """The parts of a tree for its variants; None where the check of the tree would have a note or a
+    fault about its numbers."""
+    parts = TreeParts(bodies, joints)
     inertias = [body.inertia for body in bodies if body.inertia is not None]
-    places = [joint.in_parent.translation for joint in joints]
-    if not inertias or not places:
-        return False
-    masses = np.array([inertia.mass for inertia in inertias])
-    tensors = np.array([inertia.inertia for inertia in inertias])
-    levers = np.array([inertia.lever for inertia in inertias])
-    numbers = np.concatenate([masses, tensors.ravel(), levers.ravel(), np.ravel(places)])
-    if not np.abs(numbers).max() <= LARGEST_MAGNITUDE or not (masses >= 0.0).all():
-        return False
-    negative, impossible = doubtful_moments(np.linalg.eigvalsh(tensors), masses)
-    return not (negative.any() or impossible.any())
+    plain = inertias and joints and _plain(inertias, [joint.in_parent for joint in joints])
+    return parts if plain else None
+
+
+def _plain(inertias: Sequence[pin.Inertia], places: Sequence[pin.SE3]) -> bool:
+    """Whether the numbers of a tree are those of real bodies, and of sensible size."""
+    numbers = [place.translation for place in places]
+    if inertias:
+        masses = np.array([inertia.mass for inertia in inertias])
+        tensors = np.array([inertia.inertia for inertia in inertias])
+        if not (masses >= 0.0).all():
+            return False
+        negative, impossible = doubtful_moments(np.linalg.eigvalsh(tensors), masses)
+        if negative.any() or impossible.any():
+            return False
+        numbers += [masses, tensors.ravel(), *(inertia.lever for inertia in inertias)]
+    return not numbers or bool(np.abs(np.concatenate(numbers)).max() <= LARGEST_MAGNITUDE)
 
 
 def model_of_variant(
-    known: KnownTree | None,
-    shape: tuple[Any, ...],
-    bodies: Sequence[Body],
-    joints: Sequence[Joint],
+    known: KnownTree | None, bodies: Sequence[Body], joints: Sequence[Joint]
 ) -> pin.Model | None:
-    """The model of a tree whose links have their frames at their joints; None unless its shape is
-    that of the known one.
+    """The model of a tree whose links have their frames at their joints; None unless it is the
+    known one with other translations of joints and inertias, about which the check of a tree would
+    say nothing.
 
-    Parameters
-    ----------
-    shape, bodies, joints
-        Of the tree; every joint is in its parent with the axes of this.
+    Every joint is in its parent with the axes of this.
     """
-    if known is None or not shape or shape != known.shape:
+    if known is None or not _same_tree(known.parts, bodies, joints):
+        return None
+    heavier = {
+        body.name: body.inertia
+        for body, own in zip(bodies, known.parts.bodies)
+        if body.inertia is not None and body.inertia != own.inertia
+    }
+    moved = [
+        joint for joint, own in zip(joints, known.parts.joints) if joint.in_parent != own.in_parent
+    ]
+    if not _plain(list(heavier.values()), [joint.in_parent for joint in moved]):
         return None
     model = known.model.copy()
-    inertias = {body.name: body.inertia for body in bodies}
-    for joint in joints:
+    share_scratch(known.model, model)
+    for joint in moved:
         number = model.getJointId(joint.name)
         place = joint.in_parent
         at = np.zeros(3) if is_identity(place) else place.translation + 0.0
         model.jointPlacements[number] = pin.SE3(model.jointPlacements[number].rotation, at)
-        inertia = inertias[joint.child]
-        if inertia is None:
-            continue
-        model.inertias[number] = _as_read(
-            inertia.mass, inertia.lever.tobytes(), inertia.inertia.tobytes()
-        )
+    for joint in joints:
+        inertia = heavier.get(joint.child)
+        if inertia is not None:
+            model.inertias[model.getJointId(joint.name)] = _as_read(
+                inertia.mass, inertia.lever.tobytes(), inertia.inertia.tobytes()
+            )
     return model
+
+
+def _same_tree(known: TreeParts, bodies: Sequence[Body], joints: Sequence[Joint]) -> bool:
+    """Whether bodies and joints are those that are known, but for the translations of joints and
+    the inertias of bodies."""
+    if len(bodies) != len(known.bodies) or len(joints) != len(known.joints):
+        return False
+    return all(
+        one.name == own.name and (one.inertia is None) == (own.inertia is None)
+        for one, own in zip(bodies, known.bodies)
+    ) and all(
+        one.name == own.name
+        and one.type == own.type
+        and one.parent == own.parent
+        and one.child == own.child
+        and one.axis == own.axis
+        for one, own in zip(joints, known.joints)
+    )
 
 
 @lru_cache(maxsize=KEPT_BODIES)

@@ -31,11 +31,13 @@ from srm_mbs.integration.generated.code_cache import (
 )
 from srm_mbs.integration.generated.source import Source, source_of
 from srm_mbs.integration.generated.structure import (
+    Origin,
     Structure,
     UnsupportedElementError,
+    parameters_of_variant,
     structure_of,
 )
-from srm_mbs.model.mechanism import MechanismData, per_model
+from srm_mbs.model.mechanism import MechanismData, per_model, variant_origin
 
 MOST_OPERATIONS = 40_000
 """Statements of generated code: compilation takes about 0.15 ms each, and more for each the more
@@ -180,10 +182,24 @@ def structure_of_mechanism(mechanism: Mechanism) -> tuple[Structure, FloatArray]
     InputError
         If no code can be generated for an element.
     """
+    constants = make_system(mechanism).constants()
+    origin = variant_origin(mechanism)
+    if isinstance(origin, Mechanism):
+        known = _origin(origin)
+        parameters = parameters_of_variant(mechanism.model, constants, known)
+        if parameters is not None:
+            return known.structure, parameters
     try:
-        return structure_of(mechanism.model, make_system(mechanism).constants())
+        return structure_of(mechanism.model, constants)
     except UnsupportedElementError as error:
         raise _not_generated(str(error)) from error
+
+
+@per_model
+def _origin(mechanism: Mechanism) -> Origin:
+    """A mechanism, for the structures of its variants."""
+    constants = make_system(mechanism).constants()
+    return Origin(mechanism.model, constants, *structure_of_mechanism(mechanism))
 
 
 def _not_generated(why: str) -> InputError:

@@ -450,11 +450,10 @@ class BushingEvaluator(LawEvaluator):
         Jacobian (3, 3) of that vector."""
         Ta, Tb = self.a.placement(data), self.b.placement(data)
         relative = Tb.actInv(Ta)
-        turn = pin.log3(relative.rotation)
-        if step is not None:
-            turn = step.nearest(turn)
+        shortest = pin.log3(relative.rotation)
+        turn = shortest if step is None else step.nearest(shortest)
         # dphi/dt is Jlog3 w for w in a's axes, and L^T w in b's: Jlog3 R^T = Jlog3^T.
-        L = pin.Jlog3(relative.rotation) if turn @ turn <= pi**2 else _log_jacobian(turn)
+        L = pin.Jlog3(relative.rotation) if turn is shortest else _log_jacobian(turn)
         force = self.stiffness[:3] * relative.translation
         moment = self.stiffness[3:] * turn
         if self.damping.any():
@@ -544,7 +543,7 @@ class BushingStep:
 
 
 def _log_jacobian(turn: FloatArray) -> FloatArray:
-    """Jlog3 (3, 3) at a rotation vector (3,) of more than half a turn."""
+    """Jlog3 (3, 3) at a rotation vector (3,) of half a turn and more."""
     angle = sqrt(turn @ turn)
     ratio = 0.5 * np.sin(angle) / (1.0 - np.cos(angle))
     out: FloatArray = (1.0 / angle**2 - ratio / angle) * np.outer(turn, turn)

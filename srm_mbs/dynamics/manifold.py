@@ -257,7 +257,7 @@ class Manifold:
     def position_norm(self, delta: FloatArray) -> float:
         """max |dq| over units; see :class:`~srm_mbs.dynamics.system.System`."""
         # A list: the largest of a few numbers, for which NumPy takes five times as long.
-        return max(map(abs, (delta[: self.nv] / self._unit).tolist()))
+        return float(max(map(abs, (delta[: self.nv] / self._unit).tolist())))
 
     def state_scale(self, state: FloatArray) -> FloatArray:
         """min(|q|, unit) per coordinate (the unit itself on a group), then |v|.
@@ -265,7 +265,8 @@ class Manifold:
         Angles are capped at 1 rad so that the accuracy does not decay with the number of turns.
         """
         if self._flat:
-            return np.minimum(np.abs(state), self._largest_scale)
+            out: FloatArray = np.minimum(np.abs(state), self._largest_scale)
+            return out
         q, v = self.split(state)
         position = self._unit.copy()
         vector = self._position_of >= 0

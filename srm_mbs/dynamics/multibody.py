@@ -232,14 +232,17 @@ class Mechanics(Manifold):
         self._controller = controller
         self._damping: FloatArray = self.model.damping.copy()
         self._friction: FloatArray = self.model.friction.copy()
-        self._is_damped, self._has_friction = bool(self._damping.any()), bool(self._friction.any())
+        # Of a list, because any() of a short array costs five times as much.
+        self._is_damped = any(self._damping.tolist())
+        self._has_friction = any(self._friction.tolist())
         self._is_loaded = self._is_damped or self._has_friction or controller is not None
         self.friction_speed = mechanism.friction_speed
         self._forces = resolved_forces(mechanism)
         self._first, self._last = -np.inf, np.inf
         self._bushings: dict[Evaluator, BushingStep] = {}
         self._applied: FloatArray | None = None
-        self._laws_at = np.zeros(self.nq), np.zeros(self.nv)
+        self._no_force = np.zeros(self.nv)
+        self._laws_at = np.zeros(self.nq), self._no_force
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Terms and workspaces share memory, which copies of them would not.
@@ -415,7 +418,8 @@ class Mechanics(Manifold):
         """All forces (nv,) but those of inertia, gravity and closures."""
         t = min(max(t, self._first), self._last)
         q, v = state[: self.nq], state[self.nq :]
-        force = self.applied_force(t, q, v)
+        loaded = self._is_loaded or self._applied is not None
+        force = self.applied_force(t, q, v) if loaded else self._no_force
         if self._forces is not None:
             pin.forwardKinematics(self.model, self.data, q, v)
             pin.computeJointJacobians(self.model, self.data)
@@ -499,6 +503,7 @@ class Mechanics(Manifold):
         return energy if self._forces is None else energy + self._forces.energy(self.data, q)
 
 
+_WORLD = pin.Convention.WORLD
 FRICTION_PART = 0.01
 """Part of a rate, beside the friction speed, by which stiff steps may err where friction acts: a
 tolerance far above that speed never lets a joint come to rest."""
@@ -536,7 +541,7 @@ class OpenSystem(Mechanics):
         rate = self._terms.rate()
         rate[: self.nv] = v
         rate[self.nv :] = pin.aba(self.model, self.data, q, v, force)
-        if not np.isfinite(rate).all():
+        if not blas.dasum(rate) < np.inf:
             raise EvaluationError("the acceleration is not finite")
         return self._terms
 
@@ -679,7 +684,7 @@ class ClosedSystem(Mechanics):
         t = min(max(t, self._first), self._last)
         model, data, nq = self.model, self.data, self.nq
         q, v = state[:nq], state[nq:]
-        pin.crba(model, data, q, pin.Convention.WORLD)
+        pin.crba(model, data, q, _WORLD)
         f = -pin.nonLinearEffects(model, data, q, v)
         if self._is_loaded or self._applied is not None:
             f += self.applied_force(t, q, v)

@@ -75,6 +75,8 @@ SWEEPS = 12
 CONVERGED = 0.01
 """Last relative change of places and energies in a sweep at which the collocation is solved, over
 rtol."""
+PLACING_STEPS = 4
+"""Newton steps onto the curve before an evaluation there, at most."""
 TURNED = 1.0
 """Largest relative change of the rates in that sweep, over rtol."""
 PLACE_ROUNDING = 2e-15
@@ -383,25 +385,26 @@ class PassageAlongCurve:
         closed: bool = False,
         known: bool = False,
     ) -> Node:
-        """The node next to ``place``, from one evaluation there with the ``rates`` (n,), in units;
-        ``known``: it is there, and the rates are along the curve."""
+        """The node next to ``place``, from one evaluation on the curve with the ``rates`` (n,), in
+        units; ``known``: it is there, and the rates are along the curve."""
         system, geometry, nv = self.system, self.critical.geometry, self._nv
         unit = geometry.coordinate_unit
+        if known:
+            geometry.closure(place)
+            step = turned = np.zeros(len(rates))
+            tangent = rates / float(self._curve.along @ rates)
+        else:
+            place, rates, step, tangent, matrix = self._on_curve(place, beta, rates, closed)
+            turned = self._curve.bend(place, rates, matrix)
+        M = geometry.mass()
         q, v = place[:-1] if self._driven else place, rates[:nv] * unit
         if self._driven:
             t = float(place[-1])
         sigma = system.evaluate(t, np.concatenate([q, v])).sigma
         force = system.working_force(t, q, v) * unit
         inertial = system.inertial_force(q, v) * unit
-        if known:
-            geometry.closure(place)
-            step = turned = np.zeros(len(rates))
-            tangent = rates / float(self._curve.along @ rates)
-        else:
-            step, tangent, matrix = self._curve.linearised(place, beta, closed)
-            turned = self._curve.bend(place, rates, matrix)
         tangent = tangent / self._growth(place, tangent)
-        M, own = geometry.mass(), tangent[:nv]
+        own = tangent[:nv]
         inertia = float(own @ M @ own)
         if self._driven:
             along = -turned[-1] / tangent[-1]
@@ -418,6 +421,29 @@ class PassageAlongCurve:
             acceleration=(own * along + turned[:nv]) * unit,
             sigma=sigma,
         )
+
+    def _on_curve(
+        self, place: FloatArray, beta: float, rates: FloatArray, closed: bool
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """``place`` and ``rates`` (n,) after Newton steps onto the curve, and what
+        :meth:`~srm_mbs.dynamics.singularities.critical.CurveThroughSaddle.linearised` gives there.
+
+        They take the closures alone, which cost a part of an evaluation.
+        """
+        left = PLACING_STEPS
+        while True:
+            step, tangent, matrix = self._curve.linearised(place, beta, closed)
+            if not left or self._placed(beta, float(np.abs(step).max())):
+                return place, rates, step, tangent, matrix
+            place = self.critical.geometry.move(place, step)
+            rates = float(self._curve.along @ rates) * tangent
+            left -= 1
+
+    def _placed(self, beta: float, off: float) -> bool:
+        """Whether a Newton step of the size ``off`` (units) leads to the curve at ``beta``, for the
+        tolerance or to rounding."""
+        distance = float(np.hypot(beta, self._curve.width))
+        return off <= CONVERGED * self.rtol * distance + PLACE_ROUNDING / distance
 
     def _growth(self, place: FloatArray, tangent: FloatArray) -> float:
         """Derivative of beta along ``tangent`` (n,), of which the part along is 1."""
@@ -446,14 +472,10 @@ class PassageAlongCurve:
     def _solved(self, node: Node, speed: float) -> bool:
         """Whether ``node`` is on the curve and was evaluated with the rates of the ``speed``, for
         the tolerance or to rounding."""
-        distance = float(np.hypot(node.beta, self._curve.width))
-        rounding = PLACE_ROUNDING / distance
+        rounding = PLACE_ROUNDING / (node.beta**2 + self._curve.width**2)
         rates = speed * node.tangent
         turned = float(np.abs(rates - node.rates).max() / np.abs(rates).max())
-        return (
-            node.off <= CONVERGED * self.rtol * distance + rounding
-            and turned <= TURNED * self.rtol + rounding / distance
-        )
+        return self._placed(node.beta, node.off) and turned <= TURNED * self.rtol + rounding
 
     def _panel(self, a: float, b: float) -> float:
         """Go on along the panel from ``a`` to ``b``, of xi times the heading, or only to a place

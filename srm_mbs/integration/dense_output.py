@@ -314,6 +314,11 @@ class StepData:
         return list(zip(self.times[edges[::2]].tolist(), self.times[edges[1::2]].tolist()))
 
     @property
+    def ends_stiff(self) -> bool:
+        """Whether the last step was stiff."""
+        return len(self.stiff) > 0 and bool(self.stiff[-1] > 0.0)
+
+    @property
     def end(self) -> float:
         """End of the run (s)."""
         return float(self.times[-1]) if self.stop is None else self.stop
@@ -341,8 +346,8 @@ class StepData:
     def between_nodes(self) -> list[int]:
         """The steps, ascending, that are known by the states and rates at their ends alone: those
         with a stage in the zone, and those past a critical configuration."""
-        critical = (step for one in self.critical_ranges for step in range(*one))
-        return sorted({*self.zones, *critical})
+        critical = [step for one in self.critical_ranges for step in range(*one)]
+        return sorted({*self.zones, *critical}) if critical else sorted(self.zones)
 
     @cached_property
     def layers(self) -> FloatArray:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -64,8 +64,7 @@ class RunStatus(StrEnum):
         return repr(self.value)
 
 
-@dataclass(frozen=True)
-class Attempt:
+class Attempt(NamedTuple):
     """A step that was not accepted: its start, its length, its error ratio, and the decision."""
 
     t: float

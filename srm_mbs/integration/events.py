@@ -36,6 +36,7 @@ signature already, it is ``lambda event: event``.  ``record.stop`` belongs into
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -442,7 +443,7 @@ def _with_vertices(
     """``nodes``, equally spaced, with the vertices of parabolas that come near zero between."""
     extra = []
     for (_, a), (t, b), (t_next, c) in zip(nodes, nodes[1:], nodes[2:]):
-        sign = np.sign(b)
+        sign = sign_above(b, 0.0)
         curvature = 0.5 * (a + c) - b
         if not (sign * a > 0.0 and sign * c > 0.0 and sign * curvature > 0.0):
             continue
@@ -483,7 +484,7 @@ def _zero_between(
     (a, _), (b, _) = left, right
     rising, length = right[1] > 0.0, b - a
     points = [left, right]
-    precision = float(np.finfo(float).eps) * (length + max(abs(a), abs(b)))
+    precision = sys.float_info.epsilon * (length + max(abs(a), abs(b)))
     at, steps = b, [math.inf, math.inf]
     for _ in range(MAX_ROOT_STEPS):
         new = _interpolated_zero(points)

@@ -16,6 +16,8 @@ Both are found after the run, on its dense output.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -83,6 +85,10 @@ beyond the accuracy of the run."""
 CROSSING_SEARCH = 0.3
 """Distance (rad, scene diagonals) from the dense output within which the singular configuration of
 a crossing is looked for."""
+LEAST_SIGNED = 1e-8
+"""Value over those at the sides at which the zero of a value with a sign is found."""
+SIGNED_DECREASE = 0.5
+"""Value over the smallest one so far from which on it has no sign that would change at a zero."""
 VELOCITY_VALUE = 0.05
 """Part of the values around at which the velocity is taken before and after a crossing."""
 REVERSAL_SIGMA = 0.02
@@ -187,17 +193,29 @@ class ConstraintMonitor:
         """
         times, heights = t.tolist(), (values**power).tolist()
         shortest = SMALLEST_REFINEMENT * (times[2] - times[0])
+        # A value that passes zero has a sign: the zero of that is found in fewer steps.
+        least = LEAST_SIGNED * float(values[0] + values[2])
+        signed = power == 2
         for _ in range(MAX_REFINEMENTS):
             a, b, c = times
             fa, fb, fc = heights
-            bend = (fc - fb) / (c - b) - (fb - fa) / (b - a)
-            if not bend > 0.0:
-                break
-            slope = (fb - fa) / (b - a)
-            new = 0.5 * (a + b) - 0.5 * slope * (c - a) / bend
+            if signed:
+                if math.sqrt(fb) <= least:
+                    break
+                new = _signed_zero(times, [math.sqrt(height) for height in heights])
+            else:
+                bend = (fc - fb) / (c - b) - (fb - fa) / (b - a)
+                if not bend > 0.0:
+                    break
+                slope = (fb - fa) / (b - a)
+                new = 0.5 * (a + b) - 0.5 * slope * (c - a) / bend
             if not a < new < c or abs(new - b) <= shortest:
-                break
+                if not signed:
+                    break
+                signed = False
+                continue
             value = float(self.smallest(np.array([new]))[0]) ** power
+            signed = signed and value < SIGNED_DECREASE**2 * fb
             left = new < b
             if value < fb:
                 times = [a, new, b] if left else [b, new, c]
@@ -206,6 +224,20 @@ class ConstraintMonitor:
                 times = [new, b, c] if left else [a, b, new]
                 heights = [value, fb, fc] if left else [fa, fb, value]
         return times[1], float(heights[1] ** (1.0 / power))
+
+
+def _signed_zero(t: Sequence[float], values: Sequence[float]) -> float:
+    """Zero by inverse quadratic interpolation of a value that has one between the first and the
+    last of three times t, given its sizes ``values`` there; NaN if two of them are equal."""
+    (a, b, c), (fa, fb, fc) = t, values
+    fc = -fc
+    if b > a + fa / (fa - fc) * (c - a):
+        fb = -fb
+    if fa in (fb, fc) or fb == fc:
+        return math.nan
+    of_a = a * fb * fc / ((fa - fb) * (fa - fc))
+    of_b = b * fa * fc / ((fb - fa) * (fb - fc))
+    return of_a + of_b + c * fa * fb / ((fc - fa) * (fc - fb))
 
 
 @dataclass(frozen=True)
@@ -507,8 +539,9 @@ def _rank_loss_cosine(
             return None
         G = geometry.normalised(found)
     # Rows that are zero in all of them have no part.
-    active = active_rows(np.hstack([G, G_before, G_after]))
-    G, G_before, G_after = (rows[active] for rows in (G, G_before, G_after))
+    active = active_rows(G) | active_rows(G_before) | active_rows(G_after)
+    if not active.all():
+        G, G_before, G_after = (rows[active] for rows in (G, G_before, G_after))
     left, right = monitor.near_null_spaces(G, active)
     a, b = ((left.T @ other @ right).ravel() for other in (G_before, G_after))
     return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
@@ -533,6 +566,11 @@ def _crossings_along_curves(monitor: ConstraintMonitor, steps: StepData) -> list
         lowest = first + int(np.argmin(steps.sigmas[first:last, -1]))
         time = float(steps.times[lowest + 1])
         critical = monitor.critical(time)
+        if critical is None:
+            # The steps around it may have their ends too far from it to lead there.
+            before, after = steps.times[lowest], steps.times[min(lowest + 2, steps.count)]
+            time = _closest(monitor, np.linspace(before, after, SAMPLES))
+            critical = monitor.critical(time)
         if critical is None:
             continue
         beside = 0.25 * float(steps.times[last] - steps.times[first])
@@ -690,11 +728,12 @@ def _crossing_at(
     kind = "passed"
     if not certain and monitor.avoids(time):
         kind = "avoided"
-    else:
+    # A motion that reaches a singular configuration passes or touches it: both are listed.
+    elif not value <= TOUCHING_VALUE * scale:
         cosine = _rank_loss_cosine(monitor, time, certain, before, after)
         if cosine is None:
             return None
-        if cosine > TURNED_BACK_COSINE and value > TOUCHING_VALUE * scale:
+        if cosine > TURNED_BACK_COSINE:
             time, value = monitor.minimum(times[near], values[near], power=1)
             if value > TOUCHING_VALUE * scale:
                 return None

@@ -20,7 +20,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.dynamics.observables import Observables, working_elements
+from srm_mbs.dynamics.observables import LINEAR, Observables, working_elements
 from srm_mbs.errors import KnownKeys
 from srm_mbs.integration.dense_output import StepData
 
@@ -28,8 +28,12 @@ NODES = 8
 """Gauss points per step: exact to degree 15, twice the degree of the dense output and one.  Fewer
 would err by tolerances in steps across the onset of a limit spring."""
 
-GAUSS = np.polynomial.legendre.leggauss(NODES)
-"""Points on [-1, 1] and weights."""
+SMOOTH_NODES = 6
+"""Gauss points per step where every power is a smooth function of the state, that of dampers: the
+error is then below a hundredth of the residual of a run with rtol up to 1e-4."""
+
+GAUSS = {count: np.polynomial.legendre.leggauss(count) for count in (NODES, SMOOTH_NODES)}
+"""Points on [-1, 1] and weights, by their number."""
 
 RELATIVE_ROUNDING = 1e-13
 """Bound of the rounding error of a sum of energies, relative to its terms."""
@@ -178,6 +182,14 @@ TERMS: tuple[Callable[[_Nodes, _System], Powers], ...] = (
 """Everything that does work beside the potentials; what is new is added here."""
 
 
+def _smooth(system: _System) -> bool:
+    """Whether dampers do all the work, and no force has a kink."""
+    mechanism = system.mechanism
+    return not (system.controlled or mechanism.drives or np.any(mechanism.model.friction)) and all(
+        isinstance(force, LINEAR) and not getattr(force, "slack", 0.0) for force in mechanism.forces
+    )
+
+
 def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
     """The balance of ``solution`` at its times; ``system`` is the one that made it.
 
@@ -190,7 +202,7 @@ def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
     ends = np.unique(np.concatenate([times[times < solution.steps.end], solution.t]))
     if times[0] < ends[0]:
         ends = np.concatenate([times[:1], ends])
-    points, weights = GAUSS
+    points, weights = GAUSS[SMOOTH_NODES if _smooth(system) else NODES]
     lengths = np.diff(ends)
     nodes = ends[:-1, None] + 0.5 * (points + 1.0) * lengths[:, None]
     at_nodes = cache(lambda: solution.at(nodes.ravel()))

@@ -299,6 +299,12 @@ class SimulationResult(RunOutcome):
     def settings(self) -> Settings:  # type: ignore[override]
         return self._run.settings
 
+    @property
+    def backend(self) -> str:
+        """Backend of the run: ``settings.backend``, without the rest of the settings."""
+        known = self.__dict__.get("settings")
+        return self._run.backend if known is None else known.backend
+
     @cached_property
     def _nodes(self) -> tuple[FloatArray, FloatArray]:
         """Times (n,) s, and states (n, nx) there."""
@@ -399,8 +405,7 @@ class SimulationResult(RunOutcome):
     @cached_property
     def observables(self) -> Observables:
         """Quantities at many states of the mechanism, by the backend of the run."""
-        by = self.__dict__["settings"].backend if "settings" in self.__dict__ else self._run.backend
-        by_kernel = by in COMPILED and core is not None
+        by_kernel = self.backend in COMPILED and core is not None
         return (CompiledObservables if by_kernel else Observables)(self._system)
 
     @property

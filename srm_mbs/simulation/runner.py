@@ -457,7 +457,7 @@ def assemble_problem(
     if before is None:
         by = chosen_backend(options.backend, method, options.placement, options.singular_times)
     else:
-        by = before.settings.backend
+        by = before.backend
     by, code = code_of_run(by, options.backend, mechanism)
     mechanism, state = initial_state(mechanism, t0, options.q0, options.v0)
     norm = error_norm(mechanism, options)
@@ -494,7 +494,7 @@ def assemble_problem(
     if by == "kernel" and options.backend == "auto" and code_is_compiled():
         problem.meter = Meter(mechanism)
     problem.kernel_system, problem.last_step = kernel_system, last_step
-    problem.stiff = before is not None and bool(before.steps.stiff[-1:].any())
+    problem.stiff = before is not None and before.steps.ends_stiff
     # Sweeps say at the end what they met in their steps.
     if options.t_eval is not None and isinstance(method, PSRM) and method.correction == "split":
         problem.stream = OutputStream(system, method.scheme, options.t_eval, by)

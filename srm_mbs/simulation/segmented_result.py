@@ -52,12 +52,13 @@ class SegmentedResult(SimulationResult):
         stiff = tuple(
             times
             for part in self.segments
-            if part.steps.stiff.any()
+            if np.logical_or.reduce(part.steps.stiff)
             for times in part.settings.stiff
         )
         self.settings = replace(first.settings, stiff=stiff)
         self.status, self.message = RunStatus(status), message
-        self.attempts = np.concatenate([segment.attempts for segment in self.segments])
+        attempts = [segment.attempts for segment in self.segments]
+        self.attempts = np.concatenate([some for some in attempts if len(some)] or attempts[:1])
         self._starts = np.array([segment.steps.times[0] for segment in self.segments])
         counts = zip(*(_STATISTICS(part.stats) for part in self.segments))
         self.stats = Statistics(*map(sum, counts))

@@ -618,12 +618,12 @@ def _after_actions(
 def _equations(part: SimulationResult) -> Iterator[Any]:
     """The equations of motion of ``part``, whose closures its kernel evaluates, if it can."""
     system = part.system
-    if not system.has_constraints or part.settings.backend not in COMPILED:
+    if not system.has_constraints or part.backend not in COMPILED:
         yield system
     elif part.kernel_system is not None:
         yield Evaluator(system, part.kernel_system)
     else:
-        code = code_of_record(part.settings.backend, system.mechanism)
+        code = code_of_record(part.backend, system.mechanism)
         with workspace_of(system, code) as kernel_system:
             yield Evaluator(system, kernel_system)
 

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
-from tests.support.reduced import OneDegree
+from tests.support.reduced import OneDegree, regular_slider_crank
 
 RATE = 5.0
 """Stiffness over damping of the bushing (1/s)."""
@@ -51,10 +51,48 @@ def guided_four_bar(tau: float) -> srm.Mechanism:
     return replace(srm.load("four_bar"), forces=(bushing,))
 
 
+BETWEEN = (0.0, 0.0, 0.0), (0.75, 0.0, 0.0)
+"""Points of the coupler and of the rocker whose distance changes as the four-bar moves."""
+
+
+def braced_four_bar(tau: float) -> srm.Mechanism:
+    """The four-bar with a bushing between two points of coupler and rocker that damps 1 kg /
+    ``tau`` (s): it pulls them to their least distance, where it has no leverage to damp."""
+    c = 1.0 / tau
+    planar = np.array([1.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    brace = srm.Bushing(
+        a=srm.Anchor("coupler", xyz=BETWEEN[0]),
+        b=srm.Anchor("rocker", xyz=BETWEEN[1]),
+        stiffness=tuple(RATE * c * planar),
+        damping=tuple(c * planar),
+        name="brace",
+    )
+    return replace(srm.load("four_bar"), forces=(brace,))
+
+
+def braced_reference(mechanism: srm.Mechanism, tau: float, times: FloatArray) -> FloatArray:
+    """Angles and rates (k, 2) of its crank at ``times`` (k,) s, by LSODA on its equation of one
+    degree of freedom."""
+    equation = OneDegree(replace(mechanism, forces=()), "crank")
+    forces = bushed_forces(mechanism, tau, *BETWEEN)
+
+    def field(t: float, y: FloatArray) -> list[float]:
+        v = equation.rates(*y)
+        equation.force = forces(equation.q, v)
+        return equation(t, y)
+
+    start = [mechanism.q0[0], mechanism.v0[0]]
+    run = solve_ivp(field, (0.0, times[-1]), start, "LSODA", times, rtol=1e-9, atol=1e-10)
+    assert run.success
+    states: FloatArray = run.y.T
+    return states
+
+
 def bushed_forces(
-    mechanism: srm.Mechanism, tau: float
+    mechanism: srm.Mechanism, tau: float, a: Any = A, b: Any = B
 ) -> Callable[[FloatArray, FloatArray], FloatArray]:
-    """Its generalised forces of the bushing at (q, v), the force in the rocker's axes by hand."""
+    """Its generalised forces at (q, v) of a bushing between the points ``a`` of the coupler and
+    ``b`` of the rocker, the force in the rocker's axes by hand."""
     model = mechanism.model
     data = model.createData()
     frames = [model.getFrameId(name, pin.FrameType.BODY) for name in ("coupler", "rocker")]
@@ -64,7 +102,7 @@ def bushed_forces(
         pin.computeJointJacobians(model, data, q)
         pin.updateFramePlacements(model, data)
         points, jacobians = [], []
-        for frame, at in zip(frames, (A, B)):
+        for frame, at in zip(frames, (a, b)):
             J = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)
             arm = data.oMf[frame].rotation @ np.array(at)
             points.append(data.oMf[frame].translation + arm)
@@ -197,6 +235,44 @@ def by_turns(
         t, state = end, run.y[:, -1]
         signs = np.where(np.abs(equation.rates(*state)) < 1e-7, -signs, signs)
     return np.concatenate([rows for rows in found if len(rows)])
+
+
+def rubbing_slider_crank(friction: float, start: FloatArray, times: FloatArray) -> FloatArray:
+    """Angles (k,) of the crank of slider_crank_regular at ``times`` (k,) s from its angle and rate
+    ``start``, with dry ``friction`` (N m) in both joints: from one turn to the next it is constant.
+
+    The rod turns against the crank by (d beta / d theta - 1) < 0 times the rate of the crank, so
+    that both joints turn back at the same time.
+    """
+
+    def field(t: float, y: FloatArray) -> Any:
+        s, c = np.sin(y[0]), np.cos(y[0])
+        ratio = -c / (3.0 * np.sqrt(1.0 - s * s / 9.0)) - 1.0
+        return regular_slider_crank(lambda rate: -direction * friction * (1.0 - ratio))(t, y)
+
+    def turn(t: float, y: FloatArray) -> float:
+        return float(direction * y[1])
+
+    turn.terminal, turn.direction = True, -1.0  # type: ignore[attr-defined]
+    t, state, direction, found = 0.0, start, float(np.sign(start[1])), []
+    while t < times[-1]:
+        run = solve_ivp(
+            field,
+            (t, times[-1]),
+            state,
+            "DOP853",
+            times[(times > t)],
+            rtol=1e-12,
+            atol=1e-12,
+            events=turn,
+        )
+        assert run.success
+        found.append(run.y[0])
+        if run.status == 1:
+            t, state, direction = run.t_events[0][0], run.y_events[0][0] * [1.0, 0.0], -direction
+        else:
+            t = times[-1]
+    return np.concatenate(found)
 
 
 def follower(rate: float) -> tuple[srm.Mechanism, Callable[..., FloatArray]]:

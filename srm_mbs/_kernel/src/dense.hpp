@@ -74,12 +74,20 @@ public:
     static constexpr int most_nodes = 16;  // of a polynomial
 
 private:
-    // Ends around a step: fractions of the step, places and rates there in its chart, and those
-    // nearest to it.
+    // Of Hermite's polynomial through some ends: the weights of Lagrange's basis, and its slope at
+    // each end.
+    struct Basis {
+        int count = 0;
+        int at[most_nodes];
+        double points[most_nodes], weights[most_nodes], slopes[most_nodes];
+    };
+    // Ends around a step: places and rates there in its chart, and the polynomials through all of
+    // them and through fewer, without the one, and the two, that are furthest away.
     struct EndNodes {
         long step = -1;
-        std::vector<double> points, places, rates;
-        std::vector<int> nearest;
+        int count = 0;  // 0: not enough of them
+        std::vector<double> places, rates;
+        Basis bases[3];
     };
     long step_at(double t) const;
     void take_ends(System& system, long step, EndNodes& ends) const;

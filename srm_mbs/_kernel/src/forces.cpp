@@ -154,13 +154,12 @@ void bushing(const ForceElement& e, const pinocchio::Data& data, BushingStep* st
     const SE3 Ta = placement(e.a, data), Tb = placement(e.b, data);
     const SE3 relative = Tb.actInv(Ta);
     Vector3d turn = pinocchio::log3(relative.rotation());
-    if (step) step->nearest(turn.data());
     // dphi/dt is Jlog3 w for w in a's axes, and L^T w in b's: Jlog3 R^T = Jlog3^T.
     Eigen::Matrix3d L;
-    if (turn.squaredNorm() <= pi * pi)
-        pinocchio::Jlog3(relative.rotation(), L);
-    else
+    if (step && step->nearest(turn.data()))
         pinocchio::Jlog3(turn.norm(), turn, L);
+    else
+        pinocchio::Jlog3(relative.rotation(), L);
     const Eigen::Map<const Vector3d> k_shift(&e.numbers[0]), k_turn(&e.numbers[3]);
     Vector3d force = k_shift.cwiseProduct(relative.translation());
     Vector3d moment = k_turn.cwiseProduct(turn);
@@ -285,13 +284,14 @@ BushingStep::BushingStep(const ForceElement& element, const std::vector<double>&
     Eigen::Map<Vector3d>(start_.data()) = turn;
 }
 
-void BushingStep::nearest(double* turn) {
+bool BushingStep::nearest(double* turn) {
     Eigen::Map<Vector3d> here(turn);
     const Eigen::Map<const Vector3d> start(start_.data());
     const Vector3d other = other_way(here);
-    if (!((other - start).squaredNorm() < (here - start).squaredNorm())) return;
+    if (!((other - start).squaredNorm() < (here - start).squaredNorm())) return false;
     passed_ |= other.norm() > pi + located_;
     here = other;
+    return true;
 }
 
 double BushingStep::past_half_turn(const pinocchio_model::Workspace& work, double t) {

@@ -292,10 +292,9 @@ private:
         return motion_.exact && constants_.place_rounding > rtol_ * beta * beta;
     }
 
-    // The node next to a place, from one evaluation there with the rates (n,), in units; `known`: it
-    // is there, and the rates are along the curve.
-    Node evaluated(const Vector& x, double t, double beta, const Vector& rates, bool closed,
-                   bool known = false) {
+    // The node next to a place, from one evaluation on the curve with the rates (n,), in units;
+    // `known`: it is there, and the rates are along the curve.
+    Node evaluated(Vector x, double t, double beta, Vector rates, bool closed, bool known = false) {
         Node node;
         Vector step(n_, 0.0);
         if (known) {
@@ -303,7 +302,14 @@ private:
             const double length = dot(curve_.along.data(), rates.data(), n_);
             for (double& value : node.tangent) value /= length;
         } else {
-            curve_.linearise(x, t, beta, closed, step, node.tangent);
+            // Newton steps onto the curve take the closures alone: they cost a part of an evaluation.
+            for (int k = 0;; ++k) {
+                curve_.linearise(x, t, beta, closed, step, node.tangent);
+                if (k == constants_.placing_steps || placed(beta, largest(step.data(), n_))) break;
+                closures_.move(step.data(), x, t);
+                const double length = dot(curve_.along.data(), rates.data(), n_);
+                for (int j = 0; j < n_; ++j) rates[j] = length * node.tangent[j];
+            }
         }
         const double grown = growth(x, t, node.tangent);
         for (double& value : node.tangent) value /= grown;
@@ -434,16 +440,24 @@ private:
     // Whether a node is on the curve and was evaluated with the rates of the speed, for the
     // tolerance or to rounding.
     bool solved(const Node& node, double speed) const {
-        const double distance = std::hypot(node.beta, curve_.width);
-        const double rounding = constants_.place_rounding / distance;
-        if (!(node.off <= constants_.passage_converged * rtol_ * distance + rounding)) return false;
+        if (!placed(node.beta, node.off)) return false;
         double change = 0.0, most = 0.0;
         for (int j = 0; j < n_; ++j) {
             const double rate = speed * node.tangent[j];
             change = std::max(change, std::abs(rate - node.rates[j]));
             most = std::max(most, std::abs(rate));
         }
-        return change <= (constants_.passage_turned * rtol_ + rounding / distance) * most;
+        const double distance = std::hypot(node.beta, curve_.width);
+        const double rounding = constants_.place_rounding / (distance * distance);
+        return change <= (constants_.passage_turned * rtol_ + rounding) * most;
+    }
+
+    // Whether a Newton step of the size `off` (units) leads to the curve at beta, for the tolerance
+    // or to rounding.
+    bool placed(double beta, double off) const {
+        const double distance = std::hypot(beta, curve_.width);
+        return off <= constants_.passage_converged * rtol_ * distance +
+                          constants_.place_rounding / distance;
     }
 
     // Goes on along the panel from a to b, of xi times the heading, or only to a place behind the

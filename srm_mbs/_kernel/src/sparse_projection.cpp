@@ -489,9 +489,7 @@ void SparseProjection::times_q_transposed(double* x) const {
     for (int k = 0; k < reflections_[rank]; ++k) {
         if (tau_[k] == 0.0) continue;
         const int start = reflection_start_[k], n = reflection_start_[k + 1] - start;
-        const int* at = reflection_row_.data() + start;
-        const double* v = reflection_.data() + start;
-        scattered(-tau_[k] * gathered(v, at, n, x), v, at, n, x);
+        reflected(tau_[k], reflection_.data() + start, reflection_row_.data() + start, n, x);
     }
 }
 
@@ -499,9 +497,7 @@ void SparseProjection::times_q(double* x) const {
     for (int k = reflections_[rank] - 1; k >= 0; --k) {
         if (tau_[k] == 0.0) continue;
         const int start = reflection_start_[k], n = reflection_start_[k + 1] - start;
-        const int* at = reflection_row_.data() + start;
-        const double* v = reflection_.data() + start;
-        scattered(-tau_[k] * gathered(v, at, n, x), v, at, n, x);
+        reflected(tau_[k], reflection_.data() + start, reflection_row_.data() + start, n, x);
     }
 }
 

@@ -578,6 +578,13 @@ void SplitStep::estimate_error(const IntegratorState& memory, double sigma_chang
         error_[i] = h_ * std::abs(error_[i]);
         weights_[i] = norm.weight(i, std::max(memory.state_scale[i], r.state_scale[i]));
     }
+    // stopping_tolerance in methods/stiffness.py.
+    for (const FrictionSum& sum : system_.friction_sums())
+        for (const int column : sum.columns) {
+            const int at = nv_ + column;
+            const double most = std::max(norm.atol[at], norm.rtol * norm.unit[at]);
+            weights_[at] = std::min(weights_[at], most);
+        }
     add_reversal_errors(memory);
     if (linear_)
         for (const FrictionSum& sum : system_.friction_sums()) {

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <numeric>
 
 #include "linear.hpp"
@@ -15,6 +16,8 @@ namespace {
 constexpr double floor_margin = 1.0 + 1e-12;
 // Squared norms with a ratio above this count as equal: rounding may have made the difference.
 constexpr double equal_squares = 1.0 - 1e-8;
+// In place of a squared norm that the next pivots cannot fall below.
+constexpr double not_summed = -std::numeric_limits<double>::infinity();
 
 }  // namespace
 
@@ -30,7 +33,10 @@ SweptProjection::SweptProjection(int structural_rank, double sigma_ref, const Pa
       touched_(nv),
       last_(nv),
       entries_(nv),
-      by_pivot_(structural_rank) {
+      by_pivot_(structural_rank),
+      first_rows_of_(rows_of_),
+      first_columns_of_(columns_of_) {
+    lost_.reserve(rows);
     waiting_.reserve(rows);
     deferred_.reserve(rows);
     window_.reserve(pivot_window_);
@@ -46,12 +52,23 @@ SweptProjection::SweptProjection(int structural_rank, double sigma_ref, const Pa
     std::stable_sort(row_at_.begin(), row_at_.end(),
                      [&](int a, int b) { return done[a] < done[b]; });
     for (int i = 0; i < nv; ++i) row_place_[row_at_[i]] = i;
+    rows_of_.clear(rows, nv);
+    columns_of_.clear(nv, rows);
+    for (int j = 0; j < rows; ++j) {
+        const int row_of_g = column_at_[j];
+        for (int s = support_start_[row_of_g]; s < support_start_[row_of_g + 1]; ++s) {
+            rows_of_.set(j, row_place_[support_[s]]);
+            columns_of_.set(row_place_[support_[s]], j);
+        }
+    }
+    first_rows_of_ = rows_of_;
+    first_columns_of_ = columns_of_;
 }
 
 // Copies the columns of W into the working rows, and clears them.
 void SweptProjection::take_columns() {
-    rows_of_.clear(rows, nv);
-    columns_of_.clear(nv, rows);
+    rows_of_ = first_rows_of_;
+    columns_of_ = first_columns_of_;
     for (int j = 0; j < rows; ++j) {
         const int from = column_at_[j];
         double* const a = column(from);
@@ -59,11 +76,12 @@ void SweptProjection::take_columns() {
         left_[j] = squares_[from];
         for (int s = support_start_[from]; s < support_start_[from + 1]; ++s) {
             const int k = support_[s];
+            const int i = row_place_[k];
             if (std::abs(a[k]) > small_[j]) {
-                const int i = row_place_[k];
                 row(i)[j] = a[k];
-                rows_of_.set(j, i);
-                columns_of_.set(i, j);
+            } else {
+                rows_of_.remove(j, i);
+                columns_of_.remove(i, j);
             }
             a[k] = 0.0;
         }
@@ -96,6 +114,7 @@ double SweptProjection::start_sweep() {
     double largest = 0.0;
     for (const int j : waiting_) {
         largest = std::max(largest, left_[j]);
+        summed_[j] = not_summed;
         set(open_columns_.data(), j);
     }
     return std::sqrt(largest);
@@ -243,46 +262,15 @@ void SweptProjection::eliminate(int column, bool forward) {
 // not zero.
 void SweptProjection::reflect(const int* at, double* v, int n) {
     double squares = 0.0;
-    int from = static_cast<int>(open_columns_.size()), to = -1;
-    for (int c = 0; c < n; ++c) {
-        squares += v[c] * v[c];
-        from = std::min(from, columns_of_.first[at[c]]);
-        to = std::max(to, columns_of_.last[at[c]]);
-    }
+    for (int c = 0; c < n; ++c) squares += v[c] * v[c];
     const double alpha = v[0], beta = -std::copysign(std::sqrt(squares), alpha);
     const double tau = (beta - alpha) / beta, scale = 1.0 / (alpha - beta);
     v[0] = 1.0;
     for (int c = 1; c < n; ++c) v[c] *= scale;
-    // A change of along[j] v has the length |along[j]| |v|.
-    const double length = std::sqrt(2.0 / tau);
-    double* const along = along_.data();
-    for (int w = from; w <= to; ++w) {
-        Word met = 0;
-        for (int c = 0; c < n; ++c) met |= columns_of_.words(at[c])[w];
-        if (!met) continue;
-        // From the first of these columns to the last; those between are zero in these rows.
-        const int start = (w << 6) + __builtin_ctzll(met);
-        const int count = (w << 6) + 64 - __builtin_clzll(met) - start;
-        const double* const least = small_.data() + start;
-        const double* a = row(at[0]) + start;
-        for (int j = 0; j < count; ++j) along[j] = tau * a[j];
-        for (int c = 1; c < n; ++c) add(tau * v[c], row(at[c]) + start, along, count);
-        Word changed = 0;
-        for (int j = 0; j < count; ++j) {
-            const bool kept = std::abs(along[j]) * length > least[j];
-            along[j] = kept ? along[j] : 0.0;
-            changed |= Word{kept} << j;
-        }
-        if (!changed) continue;
-        changed <<= start & 63;
-        for (int c = 0; c < n; ++c) {
-            add(-v[c], along, row(at[c]) + start, count);
-            columns_of_.add(at[c], changed, w);
-        }
-        each_bit(changed & open_columns_[w], w << 6, [&](int j) {
-            for (int c = 0; c < n; ++c) rows_of_.set(j, at[c]);
-        });
-    }
+    if (n == 2)
+        reflect_pair(at[0], at[1], v[1], tau);
+    else
+        reflect_rows(at, v, n, tau);
     const int l = reflections_[steps_ + 1]++;
     if (static_cast<int>(tau_.size()) <= l) {
         tau_.resize(2 * tau_.size());
@@ -298,6 +286,72 @@ void SweptProjection::reflect(const int* at, double* v, int n) {
     }
     reflection_start_[l + 1] = used + n;
     v[0] = beta;
+}
+
+// Applies 1 - tau v v^T with v = (1, second) to two rows, as most reflections do, where it changes
+// more than negligible parts of columns.
+void SweptProjection::reflect_pair(int one, int two, double second, double tau) {
+    double *const a = row(one), *const b = row(two);
+    const double* const least = small_.data();
+    const Word *const in_a = columns_of_.words(one), *const in_b = columns_of_.words(two);
+    // A change of along v has the length |along| |v|.
+    const double length = std::sqrt(2.0 / tau);
+    const int from = std::min(columns_of_.first[one], columns_of_.first[two]);
+    const int to = std::max(columns_of_.last[one], columns_of_.last[two]);
+    for (int w = from; w <= to; ++w) {
+        Word changed = 0;
+        each_bit(in_a[w] | in_b[w], w << 6, [&](int j) {
+            const double along = tau * (a[j] + second * b[j]);
+            if (!(std::abs(along) * length > least[j])) return;
+            a[j] -= along;
+            b[j] -= second * along;
+            changed |= Word{1} << (j & 63);
+        });
+        enter(one, changed, w);
+        enter(two, changed, w);
+    }
+}
+
+// The same with n rows.
+void SweptProjection::reflect_rows(const int* at, const double* v, int n, double tau) {
+    const double length = std::sqrt(2.0 / tau);
+    double* const along = along_.data();
+    int from = static_cast<int>(open_columns_.size()), to = -1;
+    for (int c = 0; c < n; ++c) {
+        from = std::min(from, columns_of_.first[at[c]]);
+        to = std::max(to, columns_of_.last[at[c]]);
+    }
+    for (int w = from; w <= to; ++w) {
+        Word met = 0;
+        for (int c = 0; c < n; ++c) met |= columns_of_.words(at[c])[w];
+        if (!met) continue;
+        // From the first of these columns to the last; those between are zero in these rows.
+        const int gap = __builtin_ctzll(met), count = 64 - __builtin_clzll(met) - gap;
+        const int start = (w << 6) + gap;
+        const double* const least = small_.data() + start;
+        const double* a = row(at[0]) + start;
+        for (int j = 0; j < count; ++j) along[j] = tau * a[j];
+        for (int c = 1; c < n; ++c) add(tau * v[c], row(at[c]) + start, along, count);
+        Word changed = 0;
+        for (int j = 0; j < count; ++j) {
+            const bool kept = std::abs(along[j]) * length > least[j];
+            along[j] = kept ? along[j] : 0.0;
+            changed |= Word{kept} << j;
+        }
+        if (!changed) continue;
+        for (int c = 0; c < n; ++c) {
+            add(-v[c], along, row(at[c]) + start, count);
+            enter(at[c], changed << gap, w);
+        }
+    }
+}
+
+// Columns of word w that have an entry in a row from now on.
+void SweptProjection::enter(int row, Word columns, int w) {
+    const Word fresh = columns & ~columns_of_.words(row)[w];
+    if (!fresh) return;
+    columns_of_.add(row, fresh, w);
+    each_bit(fresh & open_columns_[w], w << 6, [&](int j) { rows_of_.set(j, row); });
 }
 
 // Moves the row of the pivot to R.
@@ -320,13 +374,15 @@ void SweptProjection::take_right(int column, int pivot) {
             columns[kept] = column_at_[j];
             values[kept++] = value;
             left_[j] -= value * value;
+            // Only columns in the window are summed.
+            if (left_[j] <= norm_lost * summed_[j]) lost_.push_back(j);
         });
         used += kept;
     }
     right_start_[k + 1] = used;
     unset(open_rows_.data(), pivot);
-    for (const int j : window_)
-        if (left_[j] <= norm_lost * summed_[j]) left_[j] = summed_[j] = remaining(j);
+    for (const int j : lost_) left_[j] = summed_[j] = remaining(j);
+    lost_.clear();
 }
 
 // Clears the working rows.

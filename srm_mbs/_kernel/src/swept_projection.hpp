@@ -34,6 +34,9 @@ private:
     void gather(int column);
     void eliminate(int column, bool forward);
     void reflect(const int* at, double* v, int n);
+    void reflect_pair(int one, int two, double second, double tau);
+    void reflect_rows(const int* at, const double* v, int n, double tau);
+    void enter(int row, Word columns, int w);
     void take_right(int column, int pivot);
     void clear_rows();
     double* row(int i) { return &values_[static_cast<std::size_t>(i) * rows]; }
@@ -49,12 +52,16 @@ private:
     // Columns of this sweep, ascending; those deferred to the next one; those in the window.
     std::vector<int> waiting_, deferred_, window_;
     // Of each working column: size up to which entries are negligible, squared norm of what is
-    // left, and that norm when it was last summed.
+    // left, and that norm when it was last summed, in the window.
     std::vector<double> small_, left_, summed_;
+    // Columns that have lost most of that norm.
+    std::vector<int> lost_;
     // Rows of the current column, the last column to come in each, and its entries.
     std::vector<int> touched_, last_;
     std::vector<double> entries_;
     mutable std::vector<int> by_pivot_;
+    // rows_of_ and columns_of_ of W.
+    BitSets first_rows_of_, first_columns_of_;
 };
 
 }  // namespace srm

@@ -984,8 +984,13 @@ void System::rate(double* out) {
         std::copy(rate_.begin(), rate_.end(), out + nv);
         return;
     }
-    completed(projection_->white_multiplier.data(), white_.data());
-    for (int i = 0; i < nv; ++i) out[nv + i] = projection_->white_force[i] - white_[i];
+    const double *force = projection_->white_force.data(),
+                 *multiplier = projection_->white_multiplier.data();
+    if (predicted_) {
+        completed(multiplier, white_.data());
+        multiplier = white_.data();
+    }
+    for (int i = 0; i < nv; ++i) out[nv + i] = force[i] - multiplier[i];
     projection_->unwhiten(out + nv);
 }
 

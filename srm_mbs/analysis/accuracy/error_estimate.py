@@ -426,12 +426,10 @@ def compare(
     apart, rates = np.split(differences(states, np.hstack([b.q, b.v])), [nv], axis=1)
     moved = differences(np.repeat(states[:1], len(times), axis=0), states)[:, :nv]
     units = mechanism.structure.units
-    for name in mechanism.joint_names if mechanism.model.nq > nv else ():
-        joint = mechanism.joint(name)
-        if joint.nv == 1 and joint.nq > 1:  # angle unwrapped
-            angle, _ = a.joint(name)
-            apart[:, joint.idx_v] = b.joint(name)[0] - angle
-            moved[:, joint.idx_v] = angle - angle[:1]
+    for name, k in _turning_joints(mechanism):
+        angle, _ = a.joint(name)  # unwrapped
+        apart[:, k] = b.joint(name)[0] - angle
+        moved[:, k] = angle - angle[:1]
     size = np.column_stack(
         [
             np.abs(apart / units.coordinate).max(axis=1, initial=0.0),
@@ -439,17 +437,32 @@ def compare(
         ]
     )
     parts = _parts(mechanism)
-    order = np.concatenate([own for _, _, own in parts])
-    starts = np.cumsum([0, *(len(own) for _, _, own in parts[:-1])])
     # The norm over the coordinates of each part, at the time at which it is largest.
-    largest = [
-        np.sqrt(np.add.reduceat(x[:, order] ** 2, starts, axis=1).max(axis=0, initial=0.0)).tolist()
-        for x in (apart, rates, moved, a.v)
-    ]
+    largest = [_largest_norms(x, parts) for x in (apart, rates, moved, a.v)]
     joints = tuple(
         JointDifference(name, unit, *numbers) for (name, unit, _), *numbers in zip(parts, *largest)
     )
     return Comparison(times, size, joints, jumps)
+
+
+def _largest_norms(x: FloatArray, parts: list[tuple[str, str, IndexArray]]) -> list[float]:
+    """Of the coordinates of each part in the rows of x (n, nv) the largest norm in any row."""
+    order = np.concatenate([own for _, _, own in parts])
+    if len(order) == len(parts):  # one coordinate each
+        largest = np.abs(x).max(axis=0, initial=0.0)[order]
+    else:
+        starts = np.cumsum([0, *(len(own) for _, _, own in parts[:-1])])
+        squares = np.add.reduceat(x[:, order] ** 2, starts, axis=1)
+        largest = np.sqrt(squares.max(axis=0, initial=0.0))
+    found: list[float] = largest.tolist()
+    return found
+
+
+@per_model
+def _turning_joints(mechanism: MechanismData) -> list[tuple[str, int]]:
+    """Name and velocity index of the joints whose angle is stored as cosine and sine."""
+    joints = [(name, mechanism.joint(name)) for name in mechanism.joint_names]
+    return [(name, joint.idx_v) for name, joint in joints if joint.nv == 1 and joint.nq > 1]
 
 
 @per_model

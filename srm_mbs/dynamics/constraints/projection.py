@@ -67,6 +67,7 @@ def whiten(U: FloatArray, right: FloatArray) -> FloatArray:
 
 def _whiten_in_place(U: FloatArray, right: FloatArray) -> None:
     """As :func:`whiten`, for ``right`` (n, k) in Fortran's order, which it replaces."""
+    # No unit diagonal, the leading dimension of U, and leave to overwrite.
     lapack.dtrtrs(U, right, _UPPER, _TRANSPOSED, 0, len(U), 1)
 
 
@@ -242,7 +243,8 @@ class Projection:
         self.U = cholesky(M)
         _whiten_in_place(self.U, self._white)
         W, self.white_force = self._W, self._force
-        self._gamma[:] = blas.dgemv(1.0, W, self._force, 1.0, bias, trans=1)  # W^T L^-1 f + bias
+        # W^T L^-1 f + bias; the zeros and ones are offsets and strides.
+        self._gamma[:] = blas.dgemv(1.0, W, self._force, 1.0, bias, 0, 1, 0, 1, _TRANSPOSED)
         structural = self.structural_rank
         floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold * self.sigma_ref)
         if self._graph_order:

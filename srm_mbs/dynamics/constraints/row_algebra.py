@@ -59,6 +59,10 @@ SPARSE_ABOVE = 64
 COMPILED_ABOVE = 16
 """Columns above which singular values along a motion come from factorisations on the kernel."""
 
+IN_ORDER = 1
+"""Window of pivots of a factorisation for singular values alone: any order has the same, and with
+the rows in that of the graph R fills least."""
+
 CLEAR_GAP = 100.0
 """Ratio of neighbouring pivots from which the rows of the smaller ones depend on the others."""
 
@@ -361,12 +365,17 @@ def row_algebra(pattern: BoolArray, model: pin.Model | None = None) -> RowAlgebr
     return _compiled(pattern, parents, order)
 
 
-def _compiled(pattern: BoolArray, parents: Sequence[int], order: Sequence[int]) -> CompiledAlgebra:
+def _compiled(
+    pattern: BoolArray,
+    parents: Sequence[int],
+    order: Sequence[int],
+    window: int = PIVOT_WINDOW,
+) -> CompiledAlgebra:
     from srm_mbs._kernel import core
 
     supports = _supports(pattern.shape, np.packbits(pattern).tobytes())
     return CompiledAlgebra(
-        core.Algebra(list(parents), supports, list(order), PIVOT_SHARE, PIVOT_WINDOW, "auto")  # type: ignore[union-attr]
+        core.Algebra(list(parents), supports, list(order), PIVOT_SHARE, window, "auto")  # type: ignore[union-attr]
     )
 
 
@@ -458,7 +467,7 @@ def smallest_singular_value(A: FloatArray, zero: float) -> float:
 
 def active_rows(A: FloatArray) -> BoolArray:
     """Which rows of A (m, n) are not zero (m,)."""
-    active: BoolArray = np.sqrt((A * A).sum(axis=1)) > INERT
+    active: BoolArray = np.sqrt(np.einsum("ij,ij->i", A, A)) > INERT
     return active
 
 
@@ -475,6 +484,7 @@ class SingularValues:
     def __init__(self, pattern: BoolArray) -> None:
         self._pattern = pattern
         self._algebras: dict[bytes, RowAlgebra] = {}
+        self._compiled: dict[tuple[bytes, int], CompiledAlgebra] = {}
         self._parts: dict[bytes, SingularValues] = {}
 
     @cached_property
@@ -489,17 +499,19 @@ class SingularValues:
             self._parts[key] = SingularValues(self._pattern[active])
         return self._parts[key]
 
-    def compiled(self, active: BoolArray) -> CompiledAlgebra | None:
+    def compiled(self, active: BoolArray, window: int = IN_ORDER) -> CompiledAlgebra | None:
         """The kernel's algebra of the ``active`` rows (rows,); None for few columns, for which
-        LAPACK is as fast."""
+        LAPACK is as fast.  ``window``: number of rows along the graph of the loops of which the
+        largest is the next pivot."""
         if self._pattern.shape[1] <= COMPILED_ABOVE or not active.any():
             return None
-        key = active.tobytes()
-        found = self._algebras.get(key)
-        if not isinstance(found, CompiledAlgebra):
+        key = active.tobytes(), window
+        found = self._compiled.get(key)
+        if found is None:
             pattern = self._pattern[active]
             parents = [-1] * pattern.shape[1]
-            found = self._algebras[key] = _compiled(pattern, parents, graph_order(pattern, parents))
+            order = graph_order(pattern, parents)
+            found = self._compiled[key] = _compiled(pattern, parents, order, window)
         return found
 
     def __call__(self, matrices: FloatArray, k: int) -> FloatArray:
@@ -542,10 +554,11 @@ class SingularValues:
         return left[:, rank:], right[rank:].T
 
     def _factored_null_spaces(self, A: FloatArray, k: int) -> tuple[FloatArray, FloatArray] | None:
-        algebra = self.compiled(np.ones(len(A), dtype=bool))
-        if algebra is None or k > len(A):
+        every = np.ones(len(A), dtype=bool)
+        algebra, in_order = self.compiled(every, PIVOT_WINDOW), self.compiled(every)
+        if algebra is None or in_order is None or k > len(A):
             return None
-        smallest = algebra.smallest_of_all(A) if k == len(A) else 0.0
+        smallest = in_order.smallest_of_all(A) if k == len(A) else 0.0
         cut = max(VANISHING * smallest, LEAST_VALUE)
         algebra.factor(None, A, cut)
         pivots, rank = algebra.pivots, algebra.rank

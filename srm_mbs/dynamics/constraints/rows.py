@@ -359,9 +359,7 @@ class _LoopRows:
         p = minus(at_b, self._at_b)
         for d in self._d:
             e = d if ground else to_world(Rb, d)
-            out += e
-            out += cross3(x, e)
-            out += dot(d, p), dot(d, bias)
+            out += *e, *cross3(x, e), dot(d, p), dot(d, bias)
         for length, factor in self._distances:
             apart = math.sqrt(dot(p, p))
             if apart < COINCIDENT * length:

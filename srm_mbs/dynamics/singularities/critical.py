@@ -61,15 +61,17 @@ class CriticalConfiguration:
         Independent combinations of the normalised rows.
     u : (rank,)
         The critical combination of them, of unit length.
-    hessian : (n, n)
-        H: second derivative of u . g by the coordinates.
     """
 
     geometry: ClosureGeometry
     q: FloatArray
     rows: FloatArray
     u: FloatArray
-    hessian: FloatArray
+
+    @cached_property
+    def hessian(self) -> FloatArray:
+        """H (n, n): second derivative of u . g by the coordinates."""
+        return _hessian(self.geometry, self.rows, self.u, self.q)
 
     @cached_property
     def combination(self) -> FloatArray:
@@ -170,7 +172,7 @@ def critical_configuration(
     if not best < ACCEPTED:
         return None
     x, u = found
-    return CriticalConfiguration(geometry, x, rows, u, _hessian(geometry, rows, u, x))
+    return CriticalConfiguration(geometry, x, rows, u)
 
 
 class CurveThroughSaddle:

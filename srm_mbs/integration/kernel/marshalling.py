@@ -171,6 +171,7 @@ def constants() -> Any:
         passage_sweeps=critical_passages.SWEEPS,
         bisections=critical_passages.BISECTIONS,
         passage_converged=critical_passages.CONVERGED,
+        placing_steps=critical_passages.PLACING_STEPS,
         passage_turned=critical_passages.TURNED,
         place_rounding=critical_passages.PLACE_ROUNDING,
         extrapolated=critical_passages.EXTRAPOLATED,

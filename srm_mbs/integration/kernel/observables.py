@@ -42,8 +42,8 @@ def _make_all_rows(mechanism: Mechanism) -> Any:
 
 @per_model
 def _idle_all_rows(mechanism: Mechanism) -> deque[Any]:
-    """Those of :func:`_make_all_rows` that nobody uses."""
-    return deque(maxlen=KEPT)
+    """Those of :func:`_make_all_rows` that nobody uses; of a large mechanism one."""
+    return deque(maxlen=1 if mechanism.model.nv > LARGE else KEPT)
 
 
 class _Lent:
@@ -78,8 +78,7 @@ class CompiledObservables(Observables):
     def idle(self) -> deque[Any]:
         """Kernel systems of all rows that nobody uses."""
         mechanism = self.mechanism
-        # Drives start where the mechanism does, and results of large ones hold their workspace.
-        if mechanism.drives or mechanism.model.nv > LARGE:
+        if mechanism.drives:  # they start where the mechanism does
             return deque(maxlen=1)
         return _idle_all_rows(mechanism)
 

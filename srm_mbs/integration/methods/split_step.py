@@ -41,6 +41,7 @@ from srm_mbs.integration.methods.stiffness import (
     count_stiffness,
     reversal_error,
     stiffness_of,
+    stopping_tolerance,
 )
 
 RESIDUAL_EVERY = 16
@@ -165,15 +166,16 @@ class SplitStep:
                 stages.begin(j)
             time = t + fraction * h
             terms = system.evaluate(time, x, zone if nodes is None else None)
-            all_sigmas.append(terms.sigma)
-            on_branch = nodes is not None and terms.sigma < BRANCH_SIGMA
-            if nodes is not None and on_branch:
-                on_branch = nodes.solve_stage(time, x)
+            sigma = terms.sigma
+            all_sigmas.append(sigma)
+            if nodes is not None:
+                on_branch = sigma < BRANCH_SIGMA and nodes.solve_stage(time, x)
                 if on_branch:
                     x, rate = nodes.state, nodes.rate
                     rates[j] = system.chart_rate(delta, rate)
                     continue
-                terms = system.evaluate(time, x, zone)
+                if sigma < BRANCH_SIGMA:
+                    terms = system.evaluate(time, x, zone)
             if branch is not None:
                 terms, x, moved = branch(terms, time, fraction, x)
             rate = terms.rate()
@@ -182,7 +184,6 @@ class SplitStep:
                 rates[j] = stages.rate(j, chart_rate)
             if terms.rank_deficient:
                 deficient.append((j, terms.rank, terms.held))
-        sigma = all_sigmas[-1]
         change = abs(sigma - start)
         quiet = branch is None and sigma > WATCHED_SIGMA + FAR_STEPS * change
         state_scale = system.state_scale(x)
@@ -280,6 +281,8 @@ class SplitStep:
             ends = np.array([memory.rate, result.end_rate])
             unseen = reversal_error(h, ends[:, :k], ends[:, k:], sums, system.friction_speed)
             error[k:] = np.maximum(np.abs(error[k:]), unseen)
+            rubbing = k + np.flatnonzero(sums.any(axis=0))
+            weights[rubbing] = np.minimum(weights, stopping_tolerance(norm))[rubbing]
         if scheme.implicit is not None:
             weights = np.minimum(weights, system.friction_tolerance(result.end_rate[:k]))
         if branch is not None and history is not None:

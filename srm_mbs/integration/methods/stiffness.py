@@ -17,7 +17,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
-from srm_mbs.integration.methods.base import IntegratorState
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
 STIFF_STEPS = 15
@@ -93,6 +93,16 @@ def reversal_error(
     turned = (before * after < 0.0) & (np.abs(after - before) > UNRESOLVED * speed)
     jump = np.abs(accelerations[1] - accelerations[0])
     return np.where((sums[turned] != 0.0).any(axis=0), REVERSAL_SHARE * h * jump, 0.0)
+
+
+def stopping_tolerance(norm: ErrorNorm) -> FloatArray:
+    """Largest tolerances (n,) of coordinates on which friction acts: those of the unit.
+
+    Friction F stops a mass m of the rate v after the distance m v^2 / (2 F), which errs by m v / F
+    times the error of v: a tolerance that grew with v would err the more, the faster it was.
+    """
+    unit = norm.one if norm.unit is None else norm.unit
+    return np.maximum(norm.atol, norm.rtol * unit)
 
 
 def count_stiffness(memory: IntegratorState, stiffness: float, scheme: ButcherTableau) -> None:

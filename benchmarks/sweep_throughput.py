@@ -24,7 +24,7 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -220,6 +220,8 @@ def measure(
     """Throughput of runs of a bundled mechanism; ``count`` of them, or as many as take ``seconds``
     serially."""
     mechanism = srm.load(name)
+    with suppress(srm.InputError):  # without a compiler, the kernel makes all runs
+        srm.compile(mechanism)  # otherwise code may arrive during a sweep
 
     def run(count: int, executor: Executor | None, chunk: int | None = None) -> srm.Sweep:
         return srm.sweep(

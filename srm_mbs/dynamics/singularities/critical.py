@@ -103,11 +103,14 @@ def complement(u: FloatArray) -> FloatArray:
 def _hessian(
     geometry: ClosureGeometry, rows: FloatArray, u: FloatArray, q: FloatArray
 ) -> FloatArray:
-    columns = []
-    for e in DIFFERENCE * np.eye(len(geometry.unit)):
-        ahead = equations(geometry, rows, geometry.move(q, e))[1]
-        behind = equations(geometry, rows, geometry.move(q, -e))[1]
-        columns.append(u @ (ahead - behind) / (2.0 * DIFFERENCE))
+    combination = (u @ rows) / geometry.row_size
+
+    def gradient(e: FloatArray) -> FloatArray:
+        out: FloatArray = combination @ geometry.closure(geometry.move(q, e))[1]
+        return out
+
+    steps = DIFFERENCE * np.eye(len(geometry.unit))
+    columns = [(gradient(e) - gradient(-e)) / (2.0 * DIFFERENCE) for e in steps]
     return np.array(columns).T
 
 

@@ -77,6 +77,9 @@ CONVERGED = 0.01
 rtol."""
 PLACING_STEPS = 4
 """Newton steps onto the curve before an evaluation there, at most."""
+CONVERGING = 0.5
+"""Size of such a step, over that of the last, of the first over the distance from the critical
+configuration, from which they lead elsewhere and are not made."""
 TURNED = 1.0
 """Largest relative change of the rates in that sweep, over rtol."""
 PLACE_ROUNDING = 2e-15
@@ -430,19 +433,25 @@ class PassageAlongCurve:
 
         They take the closures alone, which cost a part of an evaluation.
         """
-        left = PLACING_STEPS
+        left, last = PLACING_STEPS, self._distance(beta)
         while True:
             step, tangent, matrix = self._curve.linearised(place, beta, closed)
-            if not left or self._placed(beta, float(np.abs(step).max())):
+            off = float(np.abs(step).max())
+            if not left or self._placed(beta, off) or not off <= CONVERGING * last:
                 return place, rates, step, tangent, matrix
+            last = off
             place = self.critical.geometry.move(place, step)
             rates = float(self._curve.along @ rates) * tangent
             left -= 1
 
+    def _distance(self, beta: float) -> float:
+        """Size of the displacement from the critical configuration at ``beta`` (units)."""
+        return float(np.hypot(beta, self._curve.width))
+
     def _placed(self, beta: float, off: float) -> bool:
         """Whether a Newton step of the size ``off`` (units) leads to the curve at ``beta``, for the
         tolerance or to rounding."""
-        distance = float(np.hypot(beta, self._curve.width))
+        distance = self._distance(beta)
         return off <= CONVERGED * self.rtol * distance + PLACE_ROUNDING / distance
 
     def _growth(self, place: FloatArray, tangent: FloatArray) -> float:

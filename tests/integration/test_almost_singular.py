@@ -193,6 +193,15 @@ def test_the_decision_is_the_same_at_every_accuracy(backend: str) -> None:
         assert {passage.kind for passage in straight.crossings} == {"passed"}
 
 
+@pytest.mark.parametrize("rtol", [1e-3, 3e-4, 1e-4, 3e-5])
+def test_a_critical_configuration_far_from_the_motion_does_not_draw_it_away(rtol: float) -> None:
+    """Newton's steps towards a curve through one would lead the walker whole turns further."""
+    mechanism = load("klann_walker")
+    exact = srm.simulate(mechanism, 2.3, rtol=1e-9, tableau="dopr54")
+    run = srm.simulate(mechanism, 2.3, rtol=rtol)
+    np.testing.assert_allclose(run.q[-1], exact.q[-1], rtol=0.0, atol=30.0 * rtol)
+
+
 def test_equal_bars_pass_with_no_residual() -> None:
     run = srm.simulate(slider_crank(0.0), 1.2, singular_tolerance=0.0)
     assert run.crossings

@@ -124,6 +124,7 @@ namespace srm {
     field(int, bisections)                                                                         \
     field(double, passage_converged)       /* last Newton step of a place, over rtol */            \
     field(int, placing_steps)              /* onto the curve, before an evaluation there */        \
+    field(double, converging)              /* ratio of such steps up to which they are made */     \
     field(double, passage_turned)          /* last relative change of rates, over rtol */          \
     field(double, place_rounding)          /* of a place (units^2), times its distance */          \
     field(double, extrapolated)            /* |beta| from which the deviation is known */          \

@@ -303,9 +303,14 @@ private:
             for (double& value : node.tangent) value /= length;
         } else {
             // Newton steps onto the curve take the closures alone: they cost a part of an evaluation.
+            double last = distance(beta);
             for (int k = 0;; ++k) {
                 curve_.linearise(x, t, beta, closed, step, node.tangent);
-                if (k == constants_.placing_steps || placed(beta, largest(step.data(), n_))) break;
+                const double off = largest(step.data(), n_);
+                if (k == constants_.placing_steps || placed(beta, off) ||
+                    !(off <= constants_.converging * last))
+                    break;
+                last = off;
                 closures_.move(step.data(), x, t);
                 const double length = dot(curve_.along.data(), rates.data(), n_);
                 for (int j = 0; j < n_; ++j) rates[j] = length * node.tangent[j];
@@ -447,18 +452,20 @@ private:
             change = std::max(change, std::abs(rate - node.rates[j]));
             most = std::max(most, std::abs(rate));
         }
-        const double distance = std::hypot(node.beta, curve_.width);
-        const double rounding = constants_.place_rounding / (distance * distance);
+        const double away = distance(node.beta);
+        const double rounding = constants_.place_rounding / (away * away);
         return change <= (constants_.passage_turned * rtol_ + rounding) * most;
     }
 
     // Whether a Newton step of the size `off` (units) leads to the curve at beta, for the tolerance
     // or to rounding.
     bool placed(double beta, double off) const {
-        const double distance = std::hypot(beta, curve_.width);
-        return off <= constants_.passage_converged * rtol_ * distance +
-                          constants_.place_rounding / distance;
+        return off <= constants_.passage_converged * rtol_ * distance(beta) +
+                          constants_.place_rounding / distance(beta);
     }
+
+    // Size of the displacement from the critical configuration at beta (units).
+    double distance(double beta) const { return std::hypot(beta, curve_.width); }
 
     // Goes on along the panel from a to b, of xi times the heading, or only to a place behind the
     // end of the passage; returns where it led.

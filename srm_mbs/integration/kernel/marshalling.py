@@ -172,6 +172,7 @@ def constants() -> Any:
         bisections=critical_passages.BISECTIONS,
         passage_converged=critical_passages.CONVERGED,
         placing_steps=critical_passages.PLACING_STEPS,
+        converging=critical_passages.CONVERGING,
         passage_turned=critical_passages.TURNED,
         place_rounding=critical_passages.PLACE_ROUNDING,
         extrapolated=critical_passages.EXTRAPOLATED,

@@ -252,6 +252,7 @@ class DaeSystem:
         self.tangent_size = self.nx
         self.multiplier_part = slice(0, self.nx)
         self.carries_yhat = T == "inverse"
+        self.wraps = False
         self.multiplier_size = self.nx if self.carries_yhat else self.ny
         self._check_values(t0, x0)
         self.projection = self._measured(t0, x0)

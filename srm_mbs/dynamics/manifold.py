@@ -177,6 +177,7 @@ class Manifold:
         self._groups = _groups(mechanism)
         self._planar = [joint for joint in self._groups if joint.group == "se2"]
         self._flat = self.nq == self.nv
+        self.wraps = bool(len(_angle_pairs(mechanism)))
         self._unit = mechanism.structure.units.coordinate
         self._position_of = _vector_coordinates(mechanism)
         self._largest_scale = np.concatenate([self._unit, np.full(self.nv, np.inf)])

@@ -108,8 +108,7 @@ def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> bool:
 
 def _whole(scheme: ButcherTableau, steps: StepData) -> FloatArray:
     """Weights (k,) of the rates of ``scheme`` over a whole step, of those that ``steps`` have."""
-    weights: FloatArray = scheme.dense.weights(np.ones(1))[0]
-    return weights[: steps.rates.shape[1]]
+    return scheme.dense.rows[0, : steps.rates.shape[1]]
 
 
 class HermiteStep:
@@ -223,7 +222,8 @@ class HermiteStep:
         points: list[float] = []
         values: list[FloatArray] = []
         for i in nodes:
-            delta = self._system.difference(self._start, steps.states[i], self._moved(i))
+            moved = self._moved(i) if self._system.wraps else None
+            delta = self._system.difference(self._start, steps.states[i], moved)
             rate = steps.rate_at(i, last)
             at, growth = self._variable((steps.times[i] - t0) / self._h)
             points += 2 * [float(at)]

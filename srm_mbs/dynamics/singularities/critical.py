@@ -139,7 +139,7 @@ def critical_configuration(
     rows = left[:, :structural_rank].T
     u = np.zeros(structural_rank)
     u[-1] = 1.0
-    n, x = len(geometry.unit), q
+    n, x, diagonal = len(geometry.unit), q, np.eye(structural_rank)
     g, G = equations(geometry, rows, x)
     delta = float(u @ g)
     moved, best, found = np.inf, np.inf, (x, u)
@@ -154,14 +154,10 @@ def critical_configuration(
             break
         if moved > FROZEN:
             H = _hessian(geometry, rows, u, x) + RIDGE * np.eye(n)
-        none = np.zeros((n, 1))
-        matrix = np.block(
-            [
-                [H, G.T, none],
-                [G, -(delta + RIDGE) * np.eye(structural_rank), -u[:, None]],
-                [none.T, u[None], np.zeros((1, 1))],
-            ]
-        )
+        matrix = np.zeros((len(value), len(value)))
+        matrix[:n, :n], matrix[:n, n:-1] = H, G.T
+        matrix[n:-1, :n], matrix[n:-1, n:-1] = G, diagonal * -(delta + RIDGE)
+        matrix[n:-1, -1], matrix[-1, n:-1] = -u, u
         step = np.linalg.solve(matrix, -value)
         moved = float(np.abs(step[:n]).max())
         if not moved < reach:

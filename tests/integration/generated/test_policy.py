@@ -271,7 +271,10 @@ def test_segments_of_a_run_keep_its_backend_while_code_arrives() -> None:
     assert finished(mechanism, 3.0, events=crossing).settings.backend == "generated"
 
 
-def test_a_run_with_code_stays_with_its_backend_where_it_switches_the_mechanism() -> None:
+def test_a_run_with_code_stays_with_its_backend_where_it_switches_the_mechanism(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(policy, "START_SECONDS", 1e3)  # nothing is compiled without being asked
     mechanism = srm.load("four_bar")
     free = mechanism.without_loop(mechanism.loops[0].name)
     release = srm.Event(

@@ -78,8 +78,8 @@ rtol."""
 PLACING_STEPS = 4
 """Newton steps onto the curve before an evaluation there, at most."""
 CONVERGING = 0.5
-"""Size of such a step, over that of the last, of the first over the distance from the critical
-configuration, from which they lead elsewhere and are not made."""
+"""Largest ratio of such a step to the one before, and of the first to the distance from the
+critical configuration: longer steps lead to other configurations, and are not made."""
 TURNED = 1.0
 """Largest relative change of the rates in that sweep, over rtol."""
 PLACE_ROUNDING = 2e-15

@@ -86,7 +86,8 @@ public:
     BushingStep(const ForceElement& element, const std::vector<double>& limits,
                 const pinocchio_model::Workspace& work, double t);
 
-    // Replaces a rotation vector by that of the opposite axis, if that is closer to the start; whether it is.
+    // Replaces a rotation vector by that of the opposite axis, if that is closer to the start;
+    // whether it is.
     bool nearest(double* turn);
     double past_half_turn(const pinocchio_model::Workspace& work, double t);
 

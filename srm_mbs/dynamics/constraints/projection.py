@@ -11,8 +11,8 @@ next to a singular configuration; pivots are dropped for redundancy only, or in 
 prediction takes their place.
 
 LAPACK is called directly: the checks of ``scipy.linalg.qr`` and ``solve_triangular`` take 10 to
-30 us each, as long as a whole stage of a small mechanism.  Its arguments are by position, since a
-name takes half as long as a solve; :func:`whiten` and :func:`unwhiten` are where they are written.
+30 us each, as long as a whole stage of a small mechanism.  What every stage calls has its arguments
+by position, because a name takes half as long as a solve.
 
 The next pivot is the column of the largest remaining norm.  With many loops the search follows
 their graph instead (:func:`swept_qr`): the fill-in of a pivot then stays next to it, so that the

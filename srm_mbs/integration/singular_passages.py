@@ -17,13 +17,14 @@ Both are found after the run, on its dense output.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
-from srm_mbs._typing import BoolArray, FloatArray
+from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import separated_pattern
 from srm_mbs.dynamics.constraints.row_algebra import (
     SingularValues,
@@ -110,6 +111,11 @@ bifurcation is looked for."""
 SAMPLES = 21
 """Samples of the motion next to a bifurcation."""
 
+T = TypeVar("T")
+Search = Generator[FloatArray, FloatArray, T]
+"""A search that yields times (k,) s, is sent the last structural singular values (k,) there, and
+returns its result."""
+
 
 @per_model
 def _singular_values(mechanism: MechanismData) -> SingularValues:
@@ -185,45 +191,76 @@ class ConstraintMonitor:
         zero."""
         return abs(critical.residual) > self._tolerance
 
-    def minimum(self, t: FloatArray, values: FloatArray, power: int = 2) -> tuple[float, float]:
-        """Time and value of the minimum bracketed by t (3,), values (3,) there.
+    def together(self, searches: Sequence[Search[T]]) -> list[T]:
+        """Results of ``searches`` that do not depend on each other.
 
-        The square of the value is a parabola where the motion passes, the value itself, of
-        ``power`` 1, where branches touch.
+        All of them are made at once, so that each of their steps takes one call for all.
         """
-        times, heights = t.tolist(), (values**power).tolist()
-        shortest = SMALLEST_REFINEMENT * (times[2] - times[0])
-        # A value that passes zero has a sign: the zero of that is found in fewer steps.
-        least = LEAST_SIGNED * float(values[0] + values[2])
-        signed = power == 2
-        for _ in range(MAX_REFINEMENTS):
-            a, b, c = times
-            fa, fb, fc = heights
-            if signed:
-                if math.sqrt(fb) <= least:
-                    break
-                new = _signed_zero(times, [math.sqrt(height) for height in heights])
-            else:
-                bend = (fc - fb) / (c - b) - (fb - fa) / (b - a)
-                if not bend > 0.0:
-                    break
-                slope = (fb - fa) / (b - a)
-                new = 0.5 * (a + b) - 0.5 * slope * (c - a) / bend
-            if not a < new < c or abs(new - b) <= shortest:
-                if not signed:
-                    break
-                signed = False
-                continue
-            value = float(self.smallest(np.array([new]))[0]) ** power
-            signed = signed and value < SIGNED_DECREASE**2 * fb
-            left = new < b
-            if value < fb:
-                times = [a, new, b] if left else [b, new, c]
-                heights = [fa, value, fb] if left else [fb, value, fc]
-            else:
-                times = [new, b, c] if left else [a, b, new]
-                heights = [value, fb, fc] if left else [fa, fb, value]
-        return times[1], float(heights[1] ** (1.0 / power))
+        found: dict[int, T] = {}
+        asked: dict[int, FloatArray] = {}
+
+        def advance(i: int, values: FloatArray | None) -> None:
+            try:
+                asked[i] = searches[i].send(values)  # type: ignore[arg-type]
+            except StopIteration as ended:
+                asked.pop(i, None)
+                found[i] = ended.value
+
+        for i in range(len(searches)):
+            advance(i, None)
+        while asked:
+            order, times = list(asked), list(asked.values())
+            values = self.smallest(np.concatenate(times))
+            at = 0
+            for i, own in zip(order, times):
+                advance(i, values[at : at + len(own)])
+                at += len(own)
+        return [found[i] for i in range(len(searches))]
+
+    def minimum(self, t: FloatArray, values: FloatArray) -> float:
+        """Time of the minimum bracketed by t (3,), values (3,) there."""
+        return self.together([_minimum(t, values)])[0][0]
+
+
+def _minimum(t: FloatArray, values: FloatArray, power: int = 2) -> Search[tuple[float, float]]:
+    """Time and value of the minimum bracketed by t (3,), values (3,) there.
+
+    The square of the value is a parabola where the motion passes, the value itself, of ``power`` 1,
+    where branches touch.
+    """
+    times, heights = t.tolist(), (values**power).tolist()
+    shortest = SMALLEST_REFINEMENT * (times[2] - times[0])
+    # A value that passes zero has a sign: the zero of that is found in fewer steps.
+    least = LEAST_SIGNED * float(values[0] + values[2])
+    signed = power == 2
+    for _ in range(MAX_REFINEMENTS):
+        a, b, c = times
+        fa, fb, fc = heights
+        if signed:
+            if math.sqrt(fb) <= least:
+                break
+            new = _signed_zero(times, [math.sqrt(height) for height in heights])
+        else:
+            bend = (fc - fb) / (c - b) - (fb - fa) / (b - a)
+            if not bend > 0.0:
+                break
+            slope = (fb - fa) / (b - a)
+            new = 0.5 * (a + b) - 0.5 * slope * (c - a) / bend
+        if not a < new < c or abs(new - b) <= shortest:
+            if not signed:
+                break
+            signed = False
+            continue
+        value = float((yield np.array([new]))[0]) ** power
+        signed = signed and value < SIGNED_DECREASE**2 * fb
+        left = new < b
+        if value < fb:
+            times = [a, new, b] if left else [b, new, c]
+            heights = [fa, value, fb] if left else [fb, value, fc]
+        else:
+            times = [new, b, c] if left else [a, b, new]
+            heights = [value, fb, fc] if left else [fa, fb, value]
+    return times[1], float(heights[1] ** (1.0 / power))
 
 
 def _signed_zero(t: Sequence[float], values: Sequence[float]) -> float:
@@ -454,40 +491,60 @@ def _largest(values: FloatArray, before: int, after: int) -> FloatArray:
     return out
 
 
-def _windows(marked: BoolArray) -> list[tuple[int, int]]:
-    """First and last sample of each run of marked intervals, one interval more on either side."""
+def _windows(marked: BoolArray) -> IndexArray:
+    """First and last sample (m, 2) of each run of marked intervals, one interval more on either
+    side; no two have a sample in common."""
     grown = marked.copy()
     grown[:-1] |= marked[1:]
     grown[1:] |= marked[:-1]
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], grown.astype(int), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist()))
+    edges: IndexArray = np.flatnonzero(np.diff(np.concatenate([[0], grown.astype(int), [0]])))
+    return edges.reshape(-1, 2)
 
 
-def _dips(sigma: FloatArray, lowest: FloatArray) -> list[tuple[int, int, int]]:
-    """Indices of the minima of the recorded ``sigma`` (k,) of a window that may be crossings, each
-    with those on both sides where it is left; ``lowest`` (k - 1,) between them.  At the ends of a
-    run the zero may lie before the first or after the last of them."""
-    before, after = np.append(np.inf, sigma[:-1]), np.append(sigma[1:], np.inf)
-    k = np.flatnonzero((sigma <= before) & (sigma < after))
+def _dips(
+    sigma: FloatArray, lowest: FloatArray, windows: IndexArray
+) -> tuple[IndexArray, IndexArray]:
+    """Minima of the recorded ``sigma`` (k,) in the ``windows`` (m, 2) that may be crossings, in
+    order: samples (n, 3), the minimum between those on both sides where it is left, and the window
+    (n,) of each.
+
+    ``lowest`` (k - 1,): between the samples.  At the ends of a run the zero may lie before the
+    first or after the last of them.
+    """
+    sizes = windows[:, 1] - windows[:, 0] + 1
+    ends = np.cumsum(sizes)
+    starts = ends - sizes
+    own = np.repeat(np.arange(len(windows)), sizes)
+    at = np.arange(len(own))  # the samples of all windows, one window after the other
+    place = at + (windows[:, 0] - starts)[own]
+    size = sigma[place]
+    before, after = np.append(np.inf, size[:-1]), np.append(size[1:], np.inf)
+    below, above = lowest[place - 1], lowest[np.minimum(place, len(lowest) - 1)]
+    before[starts] = after[ends - 1] = below[starts] = above[ends - 1] = np.inf
+    k = np.flatnonzero((size <= before) & (size < after))
     # Of small minima between the same sides, the smallest.
-    high = np.flatnonzero(sigma >= max(DEPARTED_VALUE * float(sigma.max()), 1e-12))
-    bounds = np.concatenate([[0], high, [len(sigma) - 1]])
-    first = bounds[np.searchsorted(high, np.maximum(k - 1, 0), side="right")]
-    last = bounds[np.searchsorted(high, np.minimum(k + 1, len(sigma) - 1), side="left") + 1]
-    floor = np.minimum(np.append(np.inf, lowest)[k], np.append(lowest, np.inf)[k])
-    deep = floor < RECORDED_DEPTH * np.minimum(sigma[first], sigma[last])
+    departed = np.maximum(DEPARTED_VALUE * np.maximum.reduceat(size, starts), 1e-12)
+    high = size >= departed[own]
+    left, right = high.copy(), high
+    left[starts] = right[ends - 1] = True
+    left_of = np.maximum.accumulate(np.where(left, at, 0))
+    right_of = np.minimum.accumulate(np.where(right, at, len(at))[::-1])[::-1]
+    first = left_of[np.maximum(k - 1, starts[own[k]])]
+    last = right_of[np.minimum(k + 1, ends[own[k]] - 1)]
+    floor = np.minimum(below, above)[k]
+    deep = floor < RECORDED_DEPTH * np.minimum(size[first], size[last])
     k, first, last = k[deep], first[deep], last[deep]
-    order = np.lexsort((sigma[k], first))
-    distinct = np.flatnonzero(np.diff(first[order], prepend=-1))
-    chosen = order[distinct]
-    return list(zip(first[chosen].tolist(), k[chosen].tolist(), last[chosen].tolist()))
+    order = np.lexsort((size[k], first))
+    chosen = order[np.flatnonzero(np.diff(first[order], prepend=-1))]
+    samples = np.column_stack([first[chosen], k[chosen], last[chosen]])
+    return place[samples], own[k[chosen]]
 
 
 def _times_around(
     t: FloatArray, first: int, k: int, last: int, width: int, count: int
 ) -> FloatArray:
-    """Sampling times around the sample ``k`` of a window: ``width`` intervals on either side with
-    ``count`` samples each, and the samples ``first`` and ``last``."""
+    """Sampling times around the sample ``k``: ``width`` intervals on either side with ``count``
+    samples each, and the samples ``first`` and ``last``."""
     nodes = t[max(first, k - width) : min(last, k + width) + 1]
     fractions = np.arange(count) / count
     inner = (nodes[:-1, None] + np.diff(nodes)[:, None] * fractions).ravel()
@@ -632,31 +689,25 @@ def find_crossings(
         monitor = ConstraintMonitor(analysis, dense, tolerance)
         sigma = monitor.smallest(t)
         sigma = sigma / np.median(sigma)
-    found: dict[float, Crossing] = {}
     lowest = _lowest(t, sigma, scheme.n_stages)
-    windows = [
-        (begin, end, dips)
-        for begin, end in _windows(_may_vanish(sigma, lowest, scheme.n_stages))
-        if (dips := _dips(sigma[begin : end + 1], lowest[begin:end]))
-    ]
-    if not windows and not steps.critical_ranges:
+    windows = _windows(_may_vanish(sigma, lowest, scheme.n_stages))
+    dips, window_of = _dips(sigma, lowest, windows) if len(windows) else (windows, windows[:, 0])
+    if not len(dips) and not steps.critical_ranges:
         return ()
     monitor = monitor or ConstraintMonitor(analysis, dense, tolerance)
-    tops = [t[begin + int(np.argmax(sigma[begin : end + 1]))] for begin, end, _ in windows]
-    scales = monitor.smallest(np.array(tops)).tolist() if windows else []
-    examined = [
-        (_times_around(t[begin : end + 1], *dip, DIP_WIDTHS[0], 1), t[begin : end + 1], dip, scale)
-        for (begin, end, dips), scale in zip(windows, scales)
-        for dip in dips
+    examined = np.flatnonzero(np.bincount(window_of, minlength=len(windows)))
+    tops = [
+        begin + int(np.argmax(sigma[begin : end + 1])) for begin, end in windows[examined].tolist()
     ]
-    # In one call for all of them.
-    values = monitor.smallest(np.concatenate([times for times, *_ in examined] or [t[:0]]))
-    ends = np.cumsum([len(times) for times, *_ in examined])
-    for (times, window, dip, scale), own in zip(examined, np.split(values, ends[:-1])):
-        for crossing in _crossings_at(monitor, steps, window, dip, scale, times, own):
+    scales = dict(zip(examined.tolist(), monitor.smallest(t[tops] if tops else t[:0]).tolist()))
+    searches = [
+        _crossings_at(monitor, steps, t, dip, scales[window])
+        for dip, window in zip(dips.tolist(), window_of.tolist())
+    ]
+    found: dict[float, Crossing] = {}
+    for crossings in (*monitor.together(searches), _crossings_along_curves(monitor, steps)):
+        for crossing in crossings:
             found.setdefault(crossing.time, crossing)
-    for crossing in _crossings_along_curves(monitor, steps):
-        found.setdefault(crossing.time, crossing)
     return tuple(found[time] for time in sorted(found))
 
 
@@ -664,32 +715,39 @@ def _crossings_at(
     monitor: ConstraintMonitor,
     steps: StepData,
     t: FloatArray,
-    dip: tuple[int, int, int],
+    dip: Sequence[int],
     scale: float,
-    times: FloatArray,
-    values: FloatArray,
-) -> list[Crossing]:
-    """The crossings at a minimum of sigma in a window with the samples t (k,).
+) -> Search[list[Crossing]]:
+    """The crossings at a minimum of sigma, the second of the samples ``dip``, which are indices
+    into t (k,).
 
-    ``scale``: the largest singular value there; ``values`` (n,): those at ``times`` (n,), the
-    recorded ones around the minimum.
+    ``scale``: the largest singular value of the window.
     """
+    first, k, last = dip
+    times = _times_around(t, first, k, last, DIP_WIDTHS[0], 1)
+    values = yield times
     minima = _minima(values, max(scale, float(values.max())))
     if len(minima) == 1:
         near = slice(minima[0][1] - 1, minima[0][1] + 2)
-        lowest = monitor.minimum(times[near], values[near])
+        lowest = yield from _minimum(times[near], values[near])
         if _vanishes_once(times[near], values[near], lowest, scale):
-            crossing = _crossing_at(monitor, steps, minima[0], scale, times, values, lowest)
+            crossing = yield from _crossing_at(
+                monitor, steps, minima[0], scale, times, values, lowest
+            )
             return [] if crossing is None else [crossing]
     # The widest has the samples of the others.
     for width in DIP_WIDTHS if minima else DIP_WIDTHS[-1:]:
-        times = _times_around(t, *dip, width, SAMPLES_PER_INTERVAL)
-        values = monitor.smallest(times)
+        times = _times_around(t, first, k, last, width, SAMPLES_PER_INTERVAL)
+        values = yield times
         minima = _minima(values, max(scale, float(values.max())))
         if minima:
             break
-    found = (_crossing_at(monitor, steps, one, scale, times, values) for one in minima)
-    return [crossing for crossing in found if crossing is not None]
+    found = []
+    for minimum in minima:
+        crossing = yield from _crossing_at(monitor, steps, minimum, scale, times, values)
+        if crossing is not None:
+            found.append(crossing)
+    return found
 
 
 def _vanishes_once(
@@ -712,7 +770,7 @@ def _crossing_at(
     times: FloatArray,
     values: FloatArray,
     lowest: tuple[float, float] | None = None,
-) -> Crossing | None:
+) -> Search[Crossing | None]:
     """The crossing at a ``minimum`` of the ``values`` (n,) at ``times`` (n,), from
     :func:`_minima`; None if it is none.  ``lowest``: its time and value, if they are known."""
     first, k, last = minimum
@@ -721,7 +779,7 @@ def _crossing_at(
     sides = values[[first, last]]
     if not _lowest_bracketed(times[near], values[near]) < MINIMUM_DEPTH * sides.min():
         return None
-    time, value = lowest or monitor.minimum(times[near], values[near])
+    time, value = lowest or (yield from _minimum(times[near], values[near]))
     if not value < MINIMUM_DEPTH * sides.min() or _along_curve(steps, time):
         return None
     certain = value < SINGULAR_VALUE * scale
@@ -734,7 +792,7 @@ def _crossing_at(
         if cosine is None:
             return None
         if cosine > TURNED_BACK_COSINE:
-            time, value = monitor.minimum(times[near], values[near], power=1)
+            time, value = yield from _minimum(times[near], values[near], power=1)
             if value > TOUCHING_VALUE * scale:
                 return None
     slope = float(max(sides[0] / (time - before), sides[1] / (after - time)))
@@ -829,7 +887,7 @@ def _closest(monitor: ConstraintMonitor, t: FloatArray) -> float:
     sigma = monitor.smallest(t)
     k = int(np.argmin(sigma))
     if 0 < k < SAMPLES - 1:
-        return monitor.minimum(t[k - 1 : k + 2], sigma[k - 1 : k + 2])[0]
+        return monitor.minimum(t[k - 1 : k + 2], sigma[k - 1 : k + 2])
     return float(t[k])
 
 

@@ -51,6 +51,11 @@ class Units:
     coordinate: FloatArray
     rate: float
 
+    @property
+    def motion(self) -> FloatArray:
+        """Units (2 nv,) of motions and of changes of the rates."""
+        return np.concatenate((self.coordinate, self.coordinate * self.rate))
+
 
 @per_model
 def row_angles(mechanism: MechanismData) -> BoolArray:

@@ -66,7 +66,7 @@ class ContactProbe:
 
     def __init__(self, system: System, units: Units, span: float) -> None:
         self._system = system
-        self._scale = np.concatenate([units.coordinate, units.coordinate * units.rate])
+        self._scale = units.motion
         self._time = PROBE_TIME * min(1.0 / units.rate, span)
 
     def rounding(

@@ -23,6 +23,7 @@ from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.observables import LINEAR, Observables, working_elements
 from srm_mbs.errors import KnownKeys
 from srm_mbs.integration.dense_output import StepData
+from srm_mbs.model.mechanism import per_model
 
 NODES = 8
 """Gauss points per step: exact to degree 15, twice the degree of the dense output and one.  Fewer
@@ -214,21 +215,28 @@ def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
             works[name] = np.concatenate([[0.0], np.cumsum(pieces)])[place]
     nq = solution.mechanism.model.nq
     first = solution.steps.states[:1]
-    start = float(solution.observables.energies(first[:, :nq], first[:, nq:]).sum())
-    energies = solution.observables.energies(solution.q, solution.v)
+    q = np.concatenate((first[:, :nq], solution.q))
+    energies = solution.observables.energies(q, np.concatenate((first[:, nq:], solution.v)))
+    start, energies = float(energies[0].sum()), energies[1:]
     kinetic, potential = energies.T
     sums = [[start], kinetic, energies.sum(axis=1)]
     rounding = _rounding(solution.mechanism, np.concatenate(sums))
     return EnergyBalance(solution.t, kinetic, potential, KnownKeys(works), start, rounding)
 
 
+@per_model
+def _weight(mechanism: Mechanism) -> float:
+    """Weight (N) of all bodies."""
+    mass: float = sum(inertia.mass for inertia in mechanism.model.inertias.tolist()[1:])
+    return mass * float(np.linalg.norm(mechanism.model.gravity.linear))
+
+
 def _rounding(mechanism: Mechanism, energies: FloatArray) -> float:
     """Rounding error (J) of sums of these energies, whose zero is where potentials cancel."""
-    model = mechanism.model
-    mass = sum(inertia.mass for inertia in list(model.inertias)[1:])
-    weight = mass * float(np.linalg.norm(model.gravity.linear))
     largest = float(np.abs(energies).max(initial=0.0))
-    return float(RELATIVE_ROUNDING * (weight * mechanism.structure.units.length + largest))
+    return float(
+        RELATIVE_ROUNDING * (_weight(mechanism) * mechanism.structure.units.length + largest)
+    )
 
 
 def joined_balance(

@@ -330,8 +330,7 @@ def mechanism_method(method: str | Method, tableau: str | ButcherTableau | None)
 
 def _units_of_states(mechanism: Mechanism) -> FloatArray:
     """The unit of each tangent component (2 nv,)."""
-    units = mechanism.structure.units
-    return np.concatenate([units.coordinate, units.coordinate * units.rate])
+    return mechanism.structure.units.motion
 
 
 def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArray:

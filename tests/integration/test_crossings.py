@@ -381,3 +381,26 @@ def test_loops_that_lose_rank_with_many_others_are_named_in_little_time(
     # Too many branches to list.
     assert passage.branches.shape == (0, many.model.nv)
     assert len(calls) < 200
+
+
+def test_the_calls_for_singular_values_do_not_grow_with_the_number_of_passages(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The states that they are computed at grow in proportion to it."""
+    sizes: list[int] = []
+    smallest = ConstraintMonitor.smallest
+
+    def counted(self: ConstraintMonitor, t: np.ndarray) -> np.ndarray:
+        sizes.append(len(t))
+        return smallest(self, t)
+
+    monkeypatch.setattr(ConstraintMonitor, "smallest", counted)
+    passages, calls, states = [], [], []
+    for t_end in (10.0, 100.0):
+        sizes.clear()
+        passages.append(len(srm.simulate(load("parallelogram"), t_end).crossings))
+        calls.append(len(sizes))
+        states.append(sum(sizes))
+    assert passages[1] > 9 * passages[0] > 100
+    assert calls[1] < calls[0] + 10 < 40
+    assert states[1] / passages[1] < 1.1 * states[0] / passages[0]

@@ -186,7 +186,7 @@ void DenseOutput::extended(System& system, long step, double theta, double* out)
 
 // Up to `count` ends of steps around the step, none too close together, with `least_sigma` at least,
 // and no more than `reach` steps away.
-DenseOutput::Nodes DenseOutput::nodes(const System& system, long step, int count,
+DenseOutput::Nodes DenseOutput::nodes(const System* charts, long step, int count,
                                       double least_sigma, long reach) const {
     const double *times = steps_.times, *start = steps_.states + step * nx_;
     const double near = constants_.spacing * (times[step + 1] - times[step]);
@@ -204,7 +204,7 @@ DenseOutput::Nodes DenseOutput::nodes(const System& system, long step, int count
         long* const own = left ? before : after;
         int& found = left ? left_count : right_count;
         if (found && std::abs(times[own[found - 1]] - times[node]) < near) continue;
-        if (!system.reachable(start, steps_.states + node * nx_)) {
+        if (charts && !charts->reachable(start, steps_.states + node * nx_)) {
             if (left) first = node + 1;
             else last = node - 1;
         } else if (least_sigma <= 0.0 ||
@@ -221,12 +221,12 @@ DenseOutput::Nodes DenseOutput::nodes(const System& system, long step, int count
 
 // As nodes(), without ends whose rates may carry rounding; all if few others are near, or none on
 // one side of the step: polynomials are no extrapolations.
-DenseOutput::Nodes DenseOutput::nodes_away(const System& system, long step, int count) const {
+DenseOutput::Nodes DenseOutput::nodes_away(const System* charts, long step, int count) const {
     const Nodes away =
-        nodes(system, step, count, constants_.branch_below, constants_.away_reach);
+        nodes(charts, step, count, constants_.branch_below, constants_.away_reach);
     const bool within = away.count >= constants_.least_away && away.at[0] <= step &&
                         away.at[away.count - 1] > step;
-    return within ? away : nodes(system, step, count);
+    return within ? away : nodes(charts, step, count);
 }
 
 // Motion of the positions from the step to a node, whole turns included: the sum of the motions of
@@ -316,8 +316,8 @@ const DenseOutput::Polynomial& DenseOutput::best_polynomial(System& system, long
     Nodes ends[3], away[3];
     bool same = true;
     for (int k = 0; k < 3; ++k) {
-        ends[k] = nodes(system, step, constants_.nodes[k]);
-        away[k] = nodes_away(system, step, constants_.nodes[k]);
+        ends[k] = nodes(&system, step, constants_.nodes[k]);
+        away[k] = nodes_away(&system, step, constants_.nodes[k]);
         same = same && ends[k].count == away[k].count &&
                std::equal(ends[k].at, ends[k].at + ends[k].count, away[k].at);
     }

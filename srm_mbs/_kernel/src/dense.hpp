@@ -81,18 +81,19 @@ private:
         int at[most_nodes];
         double points[most_nodes], weights[most_nodes], slopes[most_nodes];
     };
-    // Ends around a step: places and rates there in its chart, and the polynomials through all of
-    // them and through fewer, without the one, and the two, that are furthest away.
+    // Ends around a step: the coordinates of their states, without those of the step, and the rates
+    // of these, both (count, nx), and the polynomials through all of them and through those without
+    // the one that is furthest away.
     struct EndNodes {
         long step = -1;
         int count = 0;  // 0: not enough of them
         std::vector<double> places, rates;
-        Basis bases[3];
+        Basis bases[2];
     };
     long step_at(double t) const;
-    void take_ends(System& system, long step, EndNodes& ends) const;
-    bool through_ends(System& system, const EndNodes& ends, double theta, const double* allowed,
-                      double* out);
+    void take_ends(const System& system, long step, EndNodes& ends) const;
+    bool through_ends(const System& system, const EndNodes& ends, double theta,
+                      const double* allowed, double* out);
     struct Nodes {
         int count = 0;
         long at[most_nodes];  // ends of steps, ascending
@@ -107,10 +108,11 @@ private:
     const std::vector<double>& extra_rates(System& system, long step, double h);
     void extended(System& system, long step, double theta, double* out);
     const Polynomial& best_polynomial(System& system, long step);
-    Nodes nodes(const System& system, long step, int count, double least_sigma = 0.0,
+    // charts: the mechanism, if the nodes are to lie in the chart of the step.
+    Nodes nodes(const System* charts, long step, int count, double least_sigma = 0.0,
                 long reach = std::numeric_limits<long>::max()) const;
     void motion(long step, long node, double* out) const;
-    Nodes nodes_away(const System& system, long step, int count) const;
+    Nodes nodes_away(const System* charts, long step, int count) const;
     void hermite(System& system, long step, const Nodes& nodes, bool in_layer, Polynomial& out);
     double variable(long step, double theta, bool in_layer, double* growth = nullptr) const;
     void value(const Polynomial& polynomial, double theta, double* out) const;

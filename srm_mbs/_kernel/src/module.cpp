@@ -392,12 +392,9 @@ struct PySystem {
     // Powers (n, elements) of each of `elements` by itself, or of its force at rest.
     nb::object powers(const Array& t, const Array& states,
                       const std::vector<ForceElement>& elements, bool resting) {
-        const std::size_t n = count_of(t, states, state_size()), nx = state_size();
-        const std::size_t m = elements.size();
+        const std::size_t n = count_of(t, states, state_size()), m = elements.size();
         std::vector<double> out(n * m);
-        for (std::size_t i = 0; i < n; ++i)
-            system->powers(t.data()[i], states.data() + i * nx, elements, resting,
-                           out.data() + i * m);
+        system->powers(t.data(), states.data(), n, elements, resting, out.data());
         return owned_array(std::move(out), {n, m});
     }
 

@@ -48,6 +48,44 @@ private:
     const double *const origin_, *const velocity_, *const bias_;
 };
 
+// The motion from one configuration of a ball, free or planar joint to another, and the configuration
+// after a motion, as Pinocchio's algorithms for all joints have them; the arrays hold the joint's
+// components.
+template <typename Operation>
+void joint_difference(const double* from, const double* to, double* out) {
+    using Place = Eigen::Map<const Eigen::Matrix<double, Operation::NQ, 1>>;
+    Eigen::Matrix<double, Operation::NV, 1> moved;
+    Operation().difference(Place(from), Place(to), moved);
+    std::copy_n(moved.data(), moved.size(), out);
+}
+
+template <typename Operation>
+void joint_integrate(const double* from, const double* motion, double* out) {
+    Eigen::Matrix<double, Operation::NQ, 1> place;
+    Operation().integrate(Eigen::Map<const Eigen::Matrix<double, Operation::NQ, 1>>(from),
+                          Eigen::Map<const Eigen::Matrix<double, Operation::NV, 1>>(motion), place);
+    std::copy_n(place.data(), place.size(), out);
+}
+
+using Ball = pinocchio::SpecialOrthogonalOperationTpl<3, double>;
+using Free = pinocchio::SpecialEuclideanOperationTpl<3, double>;
+using Planar = pinocchio::SpecialEuclideanOperationTpl<2, double>;
+
+void joint_difference(Group group, const double* from, const double* to, double* out) {
+    if (group == Group::so3) joint_difference<Ball>(from, to, out);
+    else if (group == Group::se3) joint_difference<Free>(from, to, out);
+    else joint_difference<Planar>(from, to, out);
+}
+
+void joint_integrate(Group group, const double* from, const double* motion, double* out) {
+    if (group == Group::so3) return joint_integrate<Ball>(from, motion, out);
+    if (group == Group::se3) return joint_integrate<Free>(from, motion, out);
+    double translation[2];
+    planar_translation(from, motion, translation);  // from and out may be the same array
+    joint_integrate<Planar>(from, motion, out);
+    std::copy_n(translation, 2, out);
+}
+
 double distance(const double* x, int n) {
     double sum = 0.0;
     for (int i = 0; i < n; ++i) sum += std::abs(x[i]);
@@ -1099,30 +1137,33 @@ void System::retract(const double* state, const double* delta, double* out) {
         for (int i = 0; i < 2 * nv; ++i) out[i] = state[i] + delta[i];
         return;
     }
-    auto& w = *work_;
-    std::copy(state, state + nq, w.q.data());
-    std::copy(delta, delta + nv, w.v.data());
-    pinocchio::integrate(w.model, w.q, w.v, w.q2);
-    double translation[2];
-    for (const GroupJoint& joint : data_.groups) {
-        if (joint.group != Group::se2) continue;
-        planar_translation(state + joint.position, delta + joint.start, translation);
-        w.q2[joint.position] = translation[0];
-        w.q2[joint.position + 1] = translation[1];
+    // state and out may be the same array
+    if (wraps()) {
+        auto& w = *work_;
+        std::copy(state, state + nq, w.q.data());
+        std::copy(delta, delta + nv, w.v.data());
+        pinocchio::integrate(w.model, w.q, w.v, w.q2);
+        for (const GroupJoint& joint : data_.groups)
+            if (joint.group == Group::se2)
+                planar_translation(state + joint.position, delta + joint.start,
+                                   w.q2.data() + joint.position);
+        std::copy(w.q2.data(), w.q2.data() + nq, out);
+    } else {  // the joints that are no vectors are those of groups
+        for (int i = 0; i < nv; ++i)
+            if (const int k = data_.position_of[i]; k >= 0) out[k] = state[k] + delta[i];
+        for (const GroupJoint& joint : data_.groups)
+            joint_integrate(joint.group, state + joint.position, delta + joint.start,
+                            out + joint.position);
     }
-    // state and out may be the same array.
     for (int i = 0; i < nv; ++i) out[nq + i] = state[nq + i] + delta[nv + i];
-    std::copy(w.q2.data(), w.q2.data() + nq, out);
 }
 
 bool System::reachable(const double* start, const double* end) const {
-    if (data_.groups.empty()) return true;
-    const Eigen::VectorXd from = Eigen::Map<const Eigen::VectorXd>(start, nq);
-    const Eigen::VectorXd to = Eigen::Map<const Eigen::VectorXd>(end, nq);
-    Eigen::VectorXd moved(nv);
-    pinocchio::difference(work_->model, from, to, moved);
-    return std::all_of(data_.groups.begin(), data_.groups.end(), [&](const GroupJoint& joint) {
-        return joint.rotation(moved.data()) <= data_.farthest_node;
+    double moved[6];
+    return std::all_of(data_.groups.begin(), data_.groups.end(), [&](GroupJoint joint) {
+        joint_difference(joint.group, start + joint.position, end + joint.position, moved);
+        joint.start = 0;  // the motion of this joint alone
+        return joint.rotation(moved) <= data_.farthest_node;
     });
 }
 
@@ -1131,14 +1172,32 @@ void System::difference(const double* start, const double* end, const double* ne
         for (int i = 0; i < 2 * nv; ++i) out[i] = end[i] - start[i];
         return;
     }
-    auto& w = *work_;
     for (int i = 0; i < nv; ++i) out[nv + i] = end[nq + i] - start[nq + i];
+    // The logarithm loses digits at small angles, the exponential does not: one Newton step.
+    if (!wraps()) {  // the joints that are no vectors are those of groups
+        for (int i = 0; i < nv; ++i) {
+            const int k = data_.position_of[i];
+            if (k < 0) continue;
+            out[i] = end[k] - start[k];
+            out[i] += end[k] - (start[k] + out[i]);
+        }
+        double there[7], step[6];
+        for (const GroupJoint& joint : data_.groups) {
+            double* const own = out + joint.start;
+            const double *const from = start + joint.position, *const to = end + joint.position;
+            joint_difference(joint.group, from, to, own);
+            joint_integrate(joint.group, from, own, there);
+            joint_difference(joint.group, there, to, step);
+            for (int i = 0; i < joint.size; ++i) own[i] += step[i];
+        }
+        return;
+    }
+    auto& w = *work_;
     Eigen::VectorXd from = Eigen::Map<const Eigen::VectorXd>(start, nq);
     const Eigen::VectorXd to = Eigen::Map<const Eigen::VectorXd>(end, nq);
     Eigen::VectorXd step(nv);
     pinocchio::difference(w.model, from, to, step);
     std::copy(step.data(), step.data() + nv, out);
-    // The logarithm loses digits at small angles, the exponential does not: one Newton step.
     std::vector<double> moved(nq + nv);
     retract(start, out, moved.data());
     from = Eigen::Map<const Eigen::VectorXd>(moved.data(), nq);
@@ -1155,6 +1214,81 @@ void System::chart_rate(const double* delta, const double* rate, double* out) co
             throw EvaluationError{Failure::rotation};
         joint.dexp_inverse(delta + joint.start, rate + joint.start, data_.series,
                            out + joint.start);
+    }
+}
+
+int System::cosine_of(std::size_t angle) const {
+    const int i = data_.wrapped_angles[angle];
+    // Each wrapped angle and each group before it has one coordinate more than velocities.
+    const auto before = std::count_if(data_.groups.begin(), data_.groups.end(),
+                                      [&](const GroupJoint& joint) { return joint.start < i; });
+    return i + static_cast<int>(angle) + static_cast<int>(before);
+}
+
+void System::coordinate_rates(const double* state, const double* rate, double* out) const {
+    for (int i = 0; i < nv; ++i) {
+        if (const int k = data_.position_of[i]; k >= 0) out[k] = rate[i];
+        out[nq + i] = rate[nv + i];
+    }
+    for (std::size_t angle = 0; angle < data_.wrapped_angles.size(); ++angle) {
+        const int k = cosine_of(angle);
+        const double speed = rate[data_.wrapped_angles[angle]];
+        out[k] = -state[k + 1] * speed;
+        out[k + 1] = state[k] * speed;
+    }
+    for (const GroupJoint& joint : data_.groups) {
+        const double* q = state + joint.position;
+        const double* v = rate + joint.start;
+        double* own = out + joint.position;
+        if (joint.group == Group::se2) {
+            own[0] = q[2] * v[0] - q[3] * v[1];
+            own[1] = q[3] * v[0] + q[2] * v[1];
+            own[2] = -q[3] * v[2];
+            own[3] = q[2] * v[2];
+            continue;
+        }
+        if (joint.group == Group::se3) {
+            const Eigen::Map<const Eigen::Quaterniond> turned(q + 3);
+            const Eigen::Vector3d moving = turned * Eigen::Vector3d(v[0], v[1], v[2]);
+            own = std::copy_n(moving.data(), 3, own);
+            q += 3;
+            v += 3;
+        }
+        const Eigen::Quaterniond half(0.0, 0.5 * v[0], 0.5 * v[1], 0.5 * v[2]);
+        const Eigen::Quaterniond turning = Eigen::Quaterniond(q) * half;
+        std::copy_n(turning.coeffs().data(), 4, own);
+    }
+}
+
+void System::coordinate_errors(const double* allowed, double* out) const {
+    for (int i = 0; i < nv; ++i)
+        if (const int k = data_.position_of[i]; k >= 0) out[k] = allowed[i];
+    std::copy(allowed + nv, allowed + 2 * nv, out + nq);
+    for (std::size_t angle = 0; angle < data_.wrapped_angles.size(); ++angle)
+        std::fill_n(out + cosine_of(angle), 2, allowed[data_.wrapped_angles[angle]]);
+    for (const GroupJoint& joint : data_.groups) {
+        const double* const of = allowed + joint.start;
+        double* own = out + joint.position;
+        const int lengths = joint.group == Group::so3 ? 0 : joint.group == Group::se3 ? 3 : 2;
+        own = std::fill_n(own, lengths, lengths ? *std::min_element(of, of + lengths) : 0.0);
+        // A quaternion changes by half the angle.
+        const double angle = *std::min_element(of + lengths, of + joint.size);
+        if (joint.group == Group::se2) std::fill_n(own, 2, angle);
+        else std::fill_n(own, 4, 0.5 * angle);
+    }
+}
+
+void System::normalise(double* state) const {
+    const auto onto = [](double* x, int size) {
+        const double by = 1.0 / norm(x, size);
+        for (int i = 0; i < size; ++i) x[i] *= by;
+    };
+    for (std::size_t angle = 0; angle < data_.wrapped_angles.size(); ++angle)
+        onto(state + cosine_of(angle), 2);
+    for (const GroupJoint& joint : data_.groups) {
+        double* const own = state + joint.position;
+        if (joint.group == Group::se2) onto(own + 2, 2);
+        else onto(own + (joint.group == Group::se3 ? 3 : 0), 4);
     }
 }
 
@@ -1307,23 +1441,27 @@ std::array<double, 2> System::energies(const double* state) {
     return {kinetic, potential};
 }
 
-void System::powers(double t, const double* state, const std::vector<ForceElement>& elements,
-                    bool resting, double* out) {
+void System::powers(const double* t, const double* states, std::size_t n,
+                    const std::vector<ForceElement>& elements, bool resting, double* out) {
     auto& w = *work_;
-    const double* const v = state + nq;
-    std::copy(state, state + nq, w.q.data());
-    if (resting) w.v.setZero();
-    else std::copy(v, v + nv, w.v.data());
-    pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
-    pinocchio::computeJointJacobians(w.model, w.data);
     std::vector<BushingStep> none;
-    std::vector<ForceElement> one(1);
-    for (std::size_t k = 0; k < elements.size(); ++k) {
-        check_indices(elements[k], w.model);
-        std::fill(f_.begin(), f_.end(), 0.0);
-        one[0] = elements[k];
-        add_forces(one, data_.coincident, w, t, state, w.v.data(), none, f_.data(), nullptr);
-        out[k] = dot(f_.data(), v, nv);
+    std::vector<std::vector<ForceElement>> each;
+    for (const ForceElement& element : elements) {
+        check_indices(element, w.model);
+        each.push_back({element});
+    }
+    for (std::size_t i = 0; i < n; ++i, states += nq + nv) {
+        const double* const v = states + nq;
+        std::copy(states, v, w.q.data());
+        if (resting) w.v.setZero();
+        else std::copy(v, v + nv, w.v.data());
+        pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
+        pinocchio::computeJointJacobians(w.model, w.data);
+        for (const std::vector<ForceElement>& one : each) {
+            std::fill(f_.begin(), f_.end(), 0.0);
+            add_forces(one, data_.coincident, w, t[i], states, w.v.data(), none, f_.data(), nullptr);
+            *out++ = dot(f_.data(), v, nv);
+        }
     }
 }
 

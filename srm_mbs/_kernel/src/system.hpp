@@ -205,6 +205,12 @@ public:
     void difference(const double* start, const double* end, const double* near, double* out);
     bool reachable(const double* start, const double* end) const;
     void chart_rate(const double* delta, const double* rate, double* out) const;
+    // Motions in the coordinates of states (nx,), which need no chart: their rates, from the tangent
+    // rates (2 nv,) at a state; errors `allowed` (2 nv,) of motions and rates; and coordinates that
+    // were interpolated, moved back onto the manifold.
+    void coordinate_rates(const double* state, const double* rate, double* out) const;
+    void coordinate_errors(const double* allowed, double* out) const;
+    void normalise(double* state) const;
     double position_norm(const double* positions) const;  // largest of dq (nv,), in units
     void state_scale(const double* state, double* out) const;
     double step_limit(const double* state) const;
@@ -224,14 +230,14 @@ public:
     // The coordinates that their differences may move together.
     const ColumnGroups& column_groups();
     int rows() const { return data_.rows; }
-    // Of one state at a time, with all terms of other states lost: g - s and G v - s' (rows,); the
-    // kinetic and the potential energy, of gravity and of springs; and the powers (forces,) of
+    // With all terms of other states lost: of one state g - s and G v - s' (rows,), and the kinetic
+    // and the potential energy, of gravity and of springs; of n states the powers (n, forces) of
     // `elements`, each by itself, at the rates of the state or, if it is `resting`, those of its
     // force at rest.
     void closure_errors(double t, const double* state, double* g, double* rates);
     std::array<double, 2> energies(const double* state);
-    void powers(double t, const double* state, const std::vector<ForceElement>& elements,
-                bool resting, double* out);
+    void powers(const double* t, const double* states, std::size_t n,
+                const std::vector<ForceElement>& elements, bool resting, double* out);
     // Of the stage evaluated last: M x (nv,), all forces but those of closures (nv,), those among
     // them but those of inertia (nv,), and Gdot v - s'' (rows,).
     // Also then, in the order of the drives: the forces on their coordinates; false where rows
@@ -316,6 +322,8 @@ private:
     double* column(int row);
     double* filled(int row);
     void update_closures(const double* q, bool with_bias);
+    // Index in q of the cosine of a wrapped angle; the sine follows.
+    int cosine_of(std::size_t angle) const;
     void update_powers(const JointRow& joints, const double* q, bool with_bias);
     void update_positions(const ClosureRows& closure, bool with_bias);
     void update_alignments(const ClosureRows& closure, bool with_bias);

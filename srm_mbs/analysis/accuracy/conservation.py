@@ -71,16 +71,17 @@ def drift_of(solution: SimulationResult) -> tuple[Drift, ...]:
         ends = part.steps.times
         if part.steps.stop is not None:  # an event within the last step
             ends = ends[:-1]
-        at_ends = part.t_eval is None and len(part.t) == len(ends)
-        runs = [part if at_ends else part.at(ends), part.at(even_times(part))]
-        errors = [e for run in runs for e in run.observables.closure_errors(run.t, run.q, run.v)]
+        count = len(ends)
+        run = part.at(np.concatenate((ends, even_times(part))))
+        squares = [e * e for e in run.observables.closure_errors(run.t, run.q, run.v)]
         angles = constraint_angles(mechanism)
         length = mechanism.structure.units.length
         for unit, own, scale in (("m", ~angles, length), ("rad", angles, 1.0)):
             if own.any():
-                largest = [float(np.linalg.norm(e[:, own], axis=1).max()) for e in errors]
-                between = [max(pair) for pair in zip(largest[:2], largest[2:])]
-                found.setdefault(unit, []).append([*largest[:2], *between, scale])
+                sums = [square @ own for square in squares]
+                largest = [float(np.sqrt(each[:count].max())) for each in sums]
+                between = [float(np.sqrt(each.max())) for each in sums]
+                found.setdefault(unit, []).append([*largest, *between, scale])
     worst = {unit: np.max(parts, axis=0).tolist() for unit, parts in found.items()}
     return tuple(
         Drift(unit, *(*largest, largest[0] / scale)) for unit, (*largest, scale) in worst.items()

@@ -89,8 +89,8 @@ class JointDifference:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
-    """Differences of two runs over time.
+class Sizes:
+    """Sizes of the differences of two runs.
 
     Attributes
     ----------
@@ -99,16 +99,10 @@ class Comparison:
     size : (n, 2)
         Largest difference of any coordinate in its unit: 1 rad, or the scene diagonal; and of any
         rate, those times the characteristic rate (:class:`srm_mbs.dynamics.scaling.Units`).
-    joints
-        The largest difference of each joint.
-    jumps : (k,) s
-        Differences in time of the jumps of the state, of runs with event actions.
     """
 
     t: FloatArray
     size: FloatArray
-    joints: tuple[JointDifference, ...]
-    jumps: FloatArray
 
     @property
     def largest(self) -> float:
@@ -119,6 +113,24 @@ class Comparison:
         """The first time (s) at which ``size`` exceeds ``limit``; None if never."""
         beyond = np.flatnonzero((self.size > limit).any(axis=1))
         return float(self.t[beyond[0]]) if len(beyond) else None
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison(Sizes):
+    """Differences of two runs over time.
+
+    Attributes
+    ----------
+    t, size
+        As in :class:`Sizes`.
+    joints
+        The largest difference of each joint.
+    jumps : (k,) s
+        Differences in time of the jumps of the state, of runs with event actions.
+    """
+
+    joints: tuple[JointDifference, ...]
+    jumps: FloatArray
 
 
 @dataclass(frozen=True)
@@ -267,6 +279,8 @@ def estimate_error(
         ]
         if reading_error is not None and min(differences) > READING_MARGIN * reading_error:
             break
+    compared = kept.comparison()
+    comparison = compared if kept is whole else whole.comparison()
     order = observed_order([setting for setting, _ in runs], differences)
     beyond = 1.0
     if fixed and order is not None and order > SMALLEST_ORDER:
@@ -289,15 +303,15 @@ def estimate_error(
         tuple(trials),
         tuple(
             replace(row, position=beyond * row.position, rate=beyond * row.rate)
-            for row in kept.joints
+            for row in compared.joints
         ),
         beyond * kept.largest,
         bound,
         order,
         _expected(solution, fixed),
         apart,
-        None if apart is None else parted_at(whole, solution, partner),
-        whole,
+        None if apart is None else parted_at(comparison, solution, partner),
+        comparison,
     )
 
 
@@ -386,12 +400,8 @@ class Readings:
 
     def __init__(self, solution: SimulationResult, allowed: float | None = None) -> None:
         self._solution = solution
-        units = solution.mechanism.structure.units
-        self._allowed = None
-        if allowed is not None:
-            self._allowed = allowed * np.concatenate(
-                [units.coordinate, units.coordinate * units.rate]
-            )
+        motion = solution.mechanism.structure.units.motion
+        self._allowed = None if allowed is None else allowed * motion
         self._known: dict[tuple[int, bytes], SimulationResult] = {}
 
     def __call__(self, run: SimulationResult, times: FloatArray) -> SimulationResult:
@@ -404,45 +414,70 @@ class Readings:
         return found
 
 
+@dataclass(frozen=True, eq=False)
+class Differences(Sizes):
+    """Differences of two runs at n times.
+
+    Attributes
+    ----------
+    t, size
+        As in :class:`Sizes`.
+    jumps
+        As in :class:`Comparison`.
+    apart, rates : (n, nv)
+        Motions from one to the other, and changes of the rates.
+    run
+        The first one, read at ``t``.
+    """
+
+    jumps: FloatArray
+    apart: FloatArray
+    rates: FloatArray
+    run: SimulationResult
+
+    def comparison(self) -> Comparison:
+        """With the largest difference of each joint."""
+        mechanism, run = self.run.mechanism, self.run
+        states = np.concatenate((run.q, run.v), axis=1)
+        start = np.repeat(states[:1], len(states), axis=0)
+        moved = run.segments[0].observables.differences(start, states)[:, : mechanism.model.nv]
+        for name, k in _turning_joints(mechanism):
+            angle, _ = run.joint(name)  # unwrapped
+            moved[:, k] = angle - angle[:1]
+        parts = _parts(mechanism)
+        # The norm over the coordinates of each part, at the time at which it is largest.
+        largest = [_largest_norms(x, parts) for x in (self.apart, self.rates, moved, run.v)]
+        joints = tuple(
+            JointDifference(name, unit, *numbers)
+            for (name, unit, _), *numbers in zip(parts, *largest)
+        )
+        return Comparison(self.t, self.size, joints, self.jumps)
+
+
 def compare(
-    run: SimulationResult,
-    other: SimulationResult,
-    times: FloatArray,
-    readings: Readings | None = None,
-) -> Comparison:
-    """Compare two runs at those of ``times`` (n,) s that both cover.
+    run: SimulationResult, other: SimulationResult, times: FloatArray, read: Readings
+) -> Differences:
+    """Differences of two runs at those of ``times`` (n,) s, ascending, that both cover.
 
     Windows around jumps of the state, whose times differ, are left out.
     """
-    end = min(run.span[1], other.span[1])
-    times = times[times <= end]
-    allowed, jumps = _between_jumps(run, other, times)
-    times = times[allowed]
+    times = times[: np.searchsorted(times, min(run.span[1], other.span[1]), side="right")]
+    jumps = np.zeros(0)
+    if len(run.segments) > 1 or len(other.segments) > 1:
+        allowed, jumps = _between_jumps(run, other, times)
+        times = times[allowed]
     mechanism, nv = run.mechanism, run.mechanism.model.nv
-    read = readings or Readings(run)
     a, b = read(run, times), read(other, times)
-    states = np.hstack([a.q, a.v])
-    differences = run.segments[0].observables.differences
-    apart, rates = np.split(differences(states, np.hstack([b.q, b.v])), [nv], axis=1)
-    moved = differences(np.repeat(states[:1], len(times), axis=0), states)[:, :nv]
-    units = mechanism.structure.units
+    states = (np.concatenate((one.q, one.v), axis=1) for one in (a, b))
+    both = run.segments[0].observables.differences(*states)
+    apart, rates = both[:, :nv], both[:, nv:]
     for name, k in _turning_joints(mechanism):
-        angle, _ = a.joint(name)  # unwrapped
-        apart[:, k] = b.joint(name)[0] - angle
-        moved[:, k] = angle - angle[:1]
-    size = np.column_stack(
-        [
-            np.abs(apart / units.coordinate).max(axis=1, initial=0.0),
-            np.abs(rates / (units.coordinate * units.rate)).max(axis=1, initial=0.0),
-        ]
-    )
-    parts = _parts(mechanism)
-    # The norm over the coordinates of each part, at the time at which it is largest.
-    largest = [_largest_norms(x, parts) for x in (apart, rates, moved, a.v)]
-    joints = tuple(
-        JointDifference(name, unit, *numbers) for (name, unit, _), *numbers in zip(parts, *largest)
-    )
-    return Comparison(times, size, joints, jumps)
+        apart[:, k] = b.joint(name)[0] - a.joint(name)[0]  # unwrapped
+    parts = np.abs(both / mechanism.structure.units.motion)
+    size = np.empty((len(times), 2))
+    np.maximum.reduce(parts[:, :nv], axis=1, initial=0.0, out=size[:, 0])
+    np.maximum.reduce(parts[:, nv:], axis=1, initial=0.0, out=size[:, 1])
+    return Differences(times, size, jumps, apart, rates, a)
 
 
 def _largest_norms(x: FloatArray, parts: list[tuple[str, str, IndexArray]]) -> list[float]:

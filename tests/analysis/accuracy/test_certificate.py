@@ -12,7 +12,13 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.analysis.accuracy.assessment import Assessment, assess_errors
-from srm_mbs.analysis.accuracy.error_estimate import Comparison, compare, observed_order, parted_at
+from srm_mbs.analysis.accuracy.error_estimate import (
+    Comparison,
+    Readings,
+    compare,
+    observed_order,
+    parted_at,
+)
 from tests.support.bundled import load
 from tests.support.references import observed, reference
 
@@ -153,7 +159,8 @@ def test_angles_of_continuous_joints_are_compared_with_their_turns() -> None:
     runs = [
         srm.simulate(srm.Mechanism(model, q0=[1.0, 0.0], v0=[rate]), 5.0) for rate in (10.0, 12.0)
     ]
-    (row,) = compare(*runs, np.linspace(0.0, 5.0, 11)).joints
+    found = compare(*runs, np.linspace(0.0, 5.0, 11), Readings(runs[0]))
+    (row,) = found.comparison().joints
     assert (row.unit, row.position, row.travel) == ("rad", pytest.approx(10.0), pytest.approx(50.0))
 
 

@@ -86,6 +86,14 @@ void joint_integrate(Group group, const double* from, const double* motion, doub
     std::copy_n(translation, 2, out);
 }
 
+// Whether all coordinates are those of vectors or of groups: none of wrapped angles, and none of
+// systems of rows alone, which do not know their joints.
+bool vectors_and_groups(const SystemData& data) {
+    auto others = std::count(data.position_of.begin(), data.position_of.end(), -1);
+    for (const GroupJoint& joint : data.groups) others -= joint.size;
+    return others == 0;
+}
+
 double distance(const double* x, int n) {
     double sum = 0.0;
     for (int i = 0; i < n; ++i) sum += std::abs(x[i]);
@@ -1138,7 +1146,7 @@ void System::retract(const double* state, const double* delta, double* out) {
         return;
     }
     // state and out may be the same array
-    if (wraps()) {
+    if (!vectors_and_groups(data_)) {
         auto& w = *work_;
         std::copy(state, state + nq, w.q.data());
         std::copy(delta, delta + nv, w.v.data());
@@ -1148,7 +1156,7 @@ void System::retract(const double* state, const double* delta, double* out) {
                 planar_translation(state + joint.position, delta + joint.start,
                                    w.q2.data() + joint.position);
         std::copy(w.q2.data(), w.q2.data() + nq, out);
-    } else {  // the joints that are no vectors are those of groups
+    } else {
         for (int i = 0; i < nv; ++i)
             if (const int k = data_.position_of[i]; k >= 0) out[k] = state[k] + delta[i];
         for (const GroupJoint& joint : data_.groups)
@@ -1174,7 +1182,7 @@ void System::difference(const double* start, const double* end, const double* ne
     }
     for (int i = 0; i < nv; ++i) out[nv + i] = end[nq + i] - start[nq + i];
     // The logarithm loses digits at small angles, the exponential does not: one Newton step.
-    if (!wraps()) {  // the joints that are no vectors are those of groups
+    if (vectors_and_groups(data_)) {
         for (int i = 0; i < nv; ++i) {
             const int k = data_.position_of[i];
             if (k < 0) continue;

@@ -279,7 +279,7 @@ class ClosureGeometry:
 
     def in_turns_of(self, q: FloatArray, a: FloatArray) -> FloatArray:
         """a with the angles that count whole turns turned next to those of q."""
-        periodic = np.flatnonzero(_periodic(self.mechanism))
+        periodic = np.flatnonzero(turning_coordinates(self.mechanism))
         whole = np.zeros(len(self.unit))
         whole[periodic] = 2.0 * np.pi * np.round(self.difference(a, q)[periodic] / (2.0 * np.pi))
         return self.move(a, whole)
@@ -465,5 +465,6 @@ def column_groups(mechanism: MechanismData) -> tuple[list[list[int]], BoolArray]
 
 
 @per_model
-def _periodic(mechanism: MechanismData) -> BoolArray:
+def turning_coordinates(mechanism: MechanismData) -> BoolArray:
+    """:func:`~srm_mbs.dynamics.scaling.periodic_coordinates` of a mechanism."""
     return periodic_coordinates(mechanism.model)

@@ -452,16 +452,16 @@ def column_groups(mechanism: MechanismData) -> tuple[list[list[int]], BoolArray]
     """Which unknowns of :func:`geometry_of` may change together in differences of combinations of
     the rows of G, and which unknowns (n, n) have a row in common."""
     pattern = separated_pattern(mechanism)
-    touching: BoolArray = pattern.T @ pattern
+    related: BoolArray = pattern.T @ pattern
     groups: list[list[int]] = []
-    for j, own in enumerate(touching):
-        apart = (group for group in groups if not (touching[group].any(axis=0) & own).any())
+    for j, own in enumerate(related):
+        apart = (group for group in groups if not (related[group].any(axis=0) & own).any())
         group = next(apart, None)
         if group is None:
             groups.append([j])
         else:
             group.append(j)
-    return groups, touching
+    return groups, related
 
 
 @per_model

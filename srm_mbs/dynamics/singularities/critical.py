@@ -129,7 +129,7 @@ def _hessian(
     from the first derivative ``at_q`` (n,).
 
     Coordinates that no rows have in common change together."""
-    groups, touching = column_groups(geometry.mechanism)
+    groups, related = column_groups(geometry.mechanism)
 
     def gradient(e: FloatArray) -> FloatArray:
         out: FloatArray = weights @ geometry.closure(geometry.move(q, e))[1]
@@ -144,7 +144,7 @@ def _hessian(
             change = (gradient(e) - gradient(-e)) / (2.0 * DIFFERENCE)
         else:
             change = (gradient(e) - at_q) / DIFFERENCE
-        out[:, group] = np.where(touching[:, group], change[:, None], 0.0)
+        out[:, group] = np.where(related[:, group], change[:, None], 0.0)
     return out
 
 

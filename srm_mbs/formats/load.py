@@ -6,10 +6,11 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from numbers import Integral
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import tomli_w
@@ -21,7 +22,7 @@ from srm_mbs.formats.build import Reading, assembled
 from srm_mbs.formats.document import Document, RepeatedDocument
 from srm_mbs.formats.registry import DESCRIPTION, LINKAGE, Format, find_format, of_key
 from srm_mbs.formats.toml.description import Description, check_description
-from srm_mbs.formats.toml.parameters import given_parameters, resolved
+from srm_mbs.formats.toml.parameters import expressions, given_parameters, resolved
 from srm_mbs.formats.translation import KnownTree, Options, merged
 from srm_mbs.formats.urdf.override import override, without_overrides
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
@@ -182,6 +183,50 @@ def _translated(
         parts=translation.parts,
         model=translation.model,
         elements=elements,
+        vary=translation.vary,
+    )
+
+
+def _varied(
+    own: Document,
+    entries: Mapping[str, Any],
+    description: Description,
+    overrides: Overrides,
+    reach: Reach,
+    known: KnownLinkage,
+) -> Reading | None:
+    """A variant of a planar linkage of which nothing but numbers is read; None where it has to be
+    read as a whole.  Its texts are made as those of others when they are asked for."""
+    if description.planar is None or known.numbers is None:
+        return None
+    found = known.varied(description.planar, entries)
+    if found is None:
+        return None
+    given, description = description, found.elements.description
+
+    @cache
+    def whole() -> Source:
+        return _translated(own, entries, given, LINKAGE, own, overrides, reach).source
+
+    gravity = description.gravity if overrides.gravity is None else overrides.gravity
+    source = Source(
+        SourceTexts(lambda: whole().description, lambda: whole().urdf),
+        urdf_path=own.file,
+        path=own.file,
+        base=description.base if overrides.base is None else overrides.base,
+        gravity=_gravity(gravity),
+        format=LINKAGE.name,
+        reach=reach,
+    )
+    return Reading(
+        description,
+        entries,
+        Element("robot"),
+        source,
+        (*own.notes, *found.notes),
+        known.numbers.check,
+        model=found.model,
+        elements=found.elements,
     )
 
 
@@ -255,6 +300,11 @@ def _of_tables(
     """Read what a description, whose tables are checked, consists of or names; with the text of its
     model file."""
     if description.planar is not None:
+        varied = None
+        if known is not None and not overrides.entries():
+            varied = _varied(own, entries, description, overrides, reach, known)
+        if varied is not None:
+            return varied, None
         read = _translated(own, entries, description, LINKAGE, own, overrides, reach, known)
         return read, None
     key, name = description.model_file
@@ -295,14 +345,14 @@ def mechanism_of(reading: Reading) -> Mechanism:
         variants = replace(
             reading.variants,
             analysis=ReusableAnalysis.of(mechanism),
-            known=_known_linkage(reading, mechanism),
+            known=_known_linkage(reading, mechanism, reading.variants.own),
             kind=reading.kind,
         )
         variant_maker.keep(mechanism, variants)
     return mechanism
 
 
-def _known_linkage(reading: Reading, mechanism: Mechanism) -> KnownLinkage | None:
+def _known_linkage(reading: Reading, mechanism: Mechanism, own: Document) -> KnownLinkage | None:
     """A mechanism for its variants; None where more than its numbers made its tree, or where its
     variants need the URDF itself."""
     description, model = reading.description, mechanism.model
@@ -314,7 +364,15 @@ def _known_linkage(reading: Reading, mechanism: Mechanism) -> KnownLinkage | Non
     kept = {loop.name: loop for loop in mechanism.loops}
     described = description.closures()
     closures = tuple(kept[one.name] if kept.get(one.name) == one else one for one in described)
-    return KnownLinkage(tree, description, reading.entries, closures, mechanism.points)
+    numbers = None if reading.vary is None else reading.vary(expressions(own.toml))
+    return KnownLinkage(
+        tree,
+        description,
+        reading.entries,
+        closures,
+        mechanism.points,
+        numbers,
+    )
 
 
 def _of_file(path: Path, overrides: Overrides) -> Reading:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from typing import Any, NamedTuple
 
+import pinocchio as pin
+
 from srm_mbs.errors import InputError
+from srm_mbs.formats.planar.variants import model_with
 from srm_mbs.formats.toml.description import Description, check_description
-from srm_mbs.formats.toml.schema import InitialEntry
-from srm_mbs.formats.translation import KnownTree
+from srm_mbs.formats.toml.schema import AnchorEntry, InitialEntry, PlanarEntry
+from srm_mbs.formats.translation import KnownTree, NumbersOfVariants, merged_initial
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 
@@ -26,6 +29,14 @@ class Elements(NamedTuple):
     points: dict[str, Anchor]
 
 
+class VariedLinkage(NamedTuple):
+    """A variant of a linkage with its model, elements and notes."""
+
+    model: pin.Model
+    elements: Elements
+    notes: tuple[str, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class KnownLinkage:
     """The mechanism of a linkage, as it was read.
@@ -38,6 +49,8 @@ class KnownLinkage:
         Its checked description, translated, and the tables of this.
     closures, points
         Its closures and named points.
+    numbers
+        Of variants, where nothing else of them differs.
     """
 
     tree: KnownTree
@@ -45,10 +58,54 @@ class KnownLinkage:
     entries: Mapping[str, Any]
     closures: tuple[LoopClosure, ...]
     points: Mapping[str, Anchor]
+    numbers: NumbersOfVariants | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Without the description, whose tables have classes made at run time."""
-        return _checked_again, (self.tree, dict(self.entries), self.closures, dict(self.points))
+        kept = self.tree, dict(self.entries), self.closures, dict(self.points), self.numbers
+        return _checked_again, kept
+
+    def varied(self, entry: PlanarEntry, own: Mapping[str, Any]) -> VariedLinkage | None:
+        """The variant with the section ``entry`` of the tables ``own``; None where it has to be
+        read as a whole."""
+        if self.numbers is None:
+            return None
+        try:
+            found = self.numbers(entry)
+        except InputError:
+            return None  # reading it as a whole says what is wrong
+        model = None if found is None else model_with(self.tree, found.joints, found.inertias)
+        if found is None or model is None:
+            return None
+        closures = tuple(
+            closure.between(*(Anchor(**at) for at in found.closures[closure.name]))
+            if closure.name in found.closures
+            else closure
+            for closure in self.closures
+        )
+        if not _all_different(closures):
+            return None
+        points = dict(self.points)
+        named = own.get("points", {})
+        points |= {name: Anchor(**at) for name, at in found.points.items() if name not in named}
+        initial = merged_initial(own.get("initial", {}), found.initial)
+        description = self._starting(initial)
+        if found.forces:
+            anchors = {
+                name: {key: AnchorEntry.model_validate(at) for key, at in ends.items()}
+                for name, ends in found.forces.items()
+            }
+            forces = [
+                entry.model_copy(update=anchors.get(entry.name)) for entry in description.force
+            ]
+            description = description.model_copy(update={"force": forces})
+        return VariedLinkage(model, Elements(description, closures, points), found.notes)
+
+    def _starting(self, initial: Mapping[str, Any]) -> Description:
+        """The description with the table ``initial``, whose numbers are checked."""
+        q, v, guess = (dict(initial.get(part, {})) for part in ("q", "v", "guess"))
+        start = InitialEntry.model_construct(q=q, v=v, guess=guess)
+        return self.description.model_copy(update={"initial": start})
 
     def elements(self, entries: Mapping[str, Any]) -> Elements | None:
         """The elements of a variant with the translated tables ``entries``; None where more than
@@ -65,10 +122,7 @@ class KnownLinkage:
             return None  # the check says what is wrong
         if closures is None:
             return None
-        parts: Mapping[str, Any] = entries.get("initial", {})
-        q, v, guess = (dict(parts.get(part, {})) for part in ("q", "v", "guess"))
-        start = InitialEntry.model_construct(q=q, v=v, guess=guess)
-        return Elements(self.description.model_copy(update={"initial": start}), closures, points)
+        return Elements(self._starting(entries.get("initial", {})), closures, points)
 
     def _points(self, tables: Mapping[str, Any]) -> Iterator[tuple[str, Anchor]]:
         """Named points; those of the known ones that stay where they are, are the same."""
@@ -95,8 +149,12 @@ class KnownLinkage:
                     return None
                 closure = closure.between(Anchor(**ends["a"]), Anchor(**ends["b"]))
             found.append(closure)
-        different = {_all_but_name(one) for one in found}
-        return tuple(found) if len(different) == len(found) else None
+        return tuple(found) if _all_different(found) else None
+
+
+def _all_different(closures: Sequence[LoopClosure]) -> bool:
+    """Whether no two closures are the same but for their names."""
+    return len(closures) == len({_all_but_name(one) for one in closures})
 
 
 _all_but_name = attrgetter(*(key.name for key in fields(LoopClosure) if key.name != "name"))
@@ -107,5 +165,6 @@ def _checked_again(
     entries: dict[str, Any],
     closures: tuple[LoopClosure, ...],
     points: dict[str, Anchor],
+    numbers: NumbersOfVariants | None,
 ) -> KnownLinkage:
-    return KnownLinkage(tree, check_description(entries, ""), entries, closures, points)
+    return KnownLinkage(tree, check_description(entries, ""), entries, closures, points, numbers)

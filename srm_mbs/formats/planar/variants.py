@@ -7,7 +7,7 @@ would compute them; texts, the check of the XML and Pinocchio's reader are left 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -67,21 +67,27 @@ def model_of_variant(
     moved = [
         joint for joint, own in zip(joints, known.parts.joints) if joint.in_parent != own.in_parent
     ]
-    if not _plain(list(heavier.values()), [joint.in_parent for joint in moved]):
+    return model_with(known, moved, heavier)
+
+
+def model_with(
+    known: KnownTree, moved: Sequence[Joint], inertias: Mapping[str, pin.Inertia]
+) -> pin.Model | None:
+    """The model of ``known`` with other translations of the joints ``moved`` and other ``inertias``
+    of links, by name; None where the check of a tree would say something about them."""
+    if not _plain(list(inertias.values()), [joint.in_parent for joint in moved]):
         return None
     model = known.model.copy()
     share_scratch(known.model, model)
     for joint in moved:
-        number = model.getJointId(joint.name)
+        number = known.numbers[joint.child]
         place = joint.in_parent
         at = np.zeros(3) if is_identity(place) else place.translation + 0.0
         model.jointPlacements[number] = pin.SE3(model.jointPlacements[number].rotation, at)
-    for joint in joints:
-        inertia = heavier.get(joint.child)
-        if inertia is not None:
-            model.inertias[model.getJointId(joint.name)] = _as_read(
-                inertia.mass, inertia.lever.tobytes(), inertia.inertia.tobytes()
-            )
+    for link, inertia in inertias.items():
+        model.inertias[known.numbers[link]] = _as_read(
+            inertia.mass, inertia.lever.tobytes(), inertia.inertia.tobytes()
+        )
     return model
 
 

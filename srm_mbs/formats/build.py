@@ -36,6 +36,7 @@ from srm_mbs.formats.toml.description import Description, check_description, par
 from srm_mbs.formats.toml.parameters import Place
 from srm_mbs.formats.translation import NumbersOfVariants, TreeParts
 from srm_mbs.formats.urdf.parser import UrdfModel, build_urdf, lock_joints
+from srm_mbs.formats.urdf.variants import OverridableTree
 from srm_mbs.formats.variants import Elements
 from srm_mbs.formats.xml import parse_xml
 from srm_mbs.model.anchors import Anchor
@@ -204,6 +205,8 @@ class Reading:
         That of another variant of the description, if it is one.
     parts, model, vary
         As of :class:`~srm_mbs.formats.translation.Translation`.
+    overridable
+        The numbers of a URDF that its description changes, if variants may change them again.
     elements
         Its elements, where they are not made from the tables of the description.
     """
@@ -221,6 +224,7 @@ class Reading:
     model: pin.Model | None = None
     elements: Elements | None = None
     vary: Callable[[Sequence[Place]], NumbersOfVariants | None] | None = None
+    overridable: OverridableTree | None = None
 
 
 def unassembled(
@@ -268,26 +272,30 @@ def unassembled(
         *description.force_elements(csv),
         *_compensation(reading, model, np.array(source.gravity)),
     )
-    mechanism = reading.kind(
-        model,
-        description.closures() if elements is None else elements.closures,
-        q0=start,
-        forces=forces,
-        drives=description.drives(csv) if csv else (),
-        friction_speed=friction_speed,
-        name=description.name or model.name,
-        source=source,
-        defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
-        notes=(
+    parts: dict[str, Any] = {
+        "model": model,
+        "loops": description.closures() if elements is None else elements.closures,
+        "q0": start,
+        "forces": forces,
+        "drives": description.drives(csv) if csv else (),
+        "friction_speed": friction_speed,
+        "name": description.name or model.name,
+        "source": source,
+        "defaults": SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
+        "notes": (
             *reading.notes,
             *built.notes,
             *massless,
             *idle,
             *_friction_note(model, forces, friction_speed),
         ),
-        points=description.named_points() if elements is None else elements.points,
-        actuators=actuators,
-    )
+        "points": description.named_points() if elements is None else elements.points,
+        "actuators": actuators,
+    }
+    if elements is None:
+        mechanism = reading.kind(**parts)
+    else:
+        mechanism = reading.kind.of_checked(elements.tree_results, **parts)
     if description.limits == "spring":
         mechanism = _with_limit_springs(mechanism)
     return mechanism, q, v

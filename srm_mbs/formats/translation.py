@@ -97,10 +97,18 @@ class KnownTree:
         Its bodies and joints (:attr:`Translation.parts`).
     model
         Pinocchio's model.
+    results
+        What follows from the tree alone
+        (:attr:`~srm_mbs.model.mechanism.MechanismData.tree_results`).
     """
 
     parts: TreeParts
     model: pin.Model
+    results: dict[Any, Any]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Without results, whose functions may not be pickled."""
+        return KnownTree, (self.parts, self.model, {})
 
     @cached_property
     def numbers(self) -> dict[str, int]:

@@ -14,6 +14,8 @@ from srm_mbs.formats.planar.variants import model_with
 from srm_mbs.formats.toml.description import Description, check_description
 from srm_mbs.formats.toml.schema import AnchorEntry, InitialEntry, PlanarEntry
 from srm_mbs.formats.translation import KnownTree, NumbersOfVariants, merged_initial
+from srm_mbs.formats.urdf.override import without_overrides
+from srm_mbs.formats.urdf.variants import OverridableTree
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 
@@ -22,11 +24,13 @@ VARYING = ("loop", "points", "initial")
 
 
 class Elements(NamedTuple):
-    """A description, and its closures and points, whose tables may be those of another variant."""
+    """A description, and its closures and points, whose tables may be those of another variant;
+    and what follows from the tree of both."""
 
     description: Description
     closures: tuple[LoopClosure, ...]
     points: dict[str, Anchor]
+    tree_results: dict[Any, Any]
 
 
 class VariedLinkage(NamedTuple):
@@ -50,7 +54,11 @@ class KnownLinkage:
     closures, points
         Its closures and named points.
     numbers
-        Of variants, where nothing else of them differs.
+        Of variants of a planar linkage, where nothing else of them differs.
+    overridable
+        What ``[[override]]`` of others may change.
+    urdf_path, format
+        As of its :class:`~srm_mbs.model.mechanism.Source`.
     """
 
     tree: KnownTree
@@ -59,15 +67,35 @@ class KnownLinkage:
     closures: tuple[LoopClosure, ...]
     points: Mapping[str, Anchor]
     numbers: NumbersOfVariants | None = None
+    overridable: OverridableTree | None = None
+    urdf_path: str = ""
+    format: str = ""
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Without the description, whose tables have classes made at run time."""
-        kept = self.tree, dict(self.entries), self.closures, dict(self.points), self.numbers
-        return _checked_again, kept
+        return _checked_again, (
+            self.tree,
+            dict(self.entries),
+            self.closures,
+            dict(self.points),
+            self.numbers,
+            self.overridable,
+            self.urdf_path,
+            self.format,
+        )
 
-    def varied(self, entry: PlanarEntry, own: Mapping[str, Any]) -> VariedLinkage | None:
-        """The variant with the section ``entry`` of the tables ``own``; None where it has to be
-        read as a whole."""
+    def varied(self, given: Description, own: Mapping[str, Any]) -> VariedLinkage | None:
+        """The variant with the description ``given``, whose tables are ``own``; None where it has
+        to be read as a whole."""
+        if given.planar is not None:
+            return self._varied_linkage(given.planar, own)
+        if self.overridable is None:
+            return None
+        model = self.overridable.model(self.tree.model, given.override)
+        elements = None if model is None else self.elements(without_overrides(own))
+        return None if elements is None else VariedLinkage(model, elements, ())
+
+    def _varied_linkage(self, entry: PlanarEntry, own: Mapping[str, Any]) -> VariedLinkage | None:
         if self.numbers is None:
             return None
         try:
@@ -99,7 +127,9 @@ class KnownLinkage:
                 entry.model_copy(update=anchors.get(entry.name)) for entry in description.force
             ]
             description = description.model_copy(update={"force": forces})
-        return VariedLinkage(model, Elements(description, closures, points), found.notes)
+        return VariedLinkage(
+            model, Elements(description, closures, points, self.tree.results), found.notes
+        )
 
     def _starting(self, initial: Mapping[str, Any]) -> Description:
         """The description with the table ``initial``, whose numbers are checked."""
@@ -122,7 +152,8 @@ class KnownLinkage:
             return None  # the check says what is wrong
         if closures is None:
             return None
-        return Elements(self._starting(entries.get("initial", {})), closures, points)
+        start = self._starting(entries.get("initial", {}))
+        return Elements(start, closures, points, self.tree.results)
 
     def _points(self, tables: Mapping[str, Any]) -> Iterator[tuple[str, Anchor]]:
         """Named points; those of the known ones that stay where they are, are the same."""
@@ -165,6 +196,6 @@ def _checked_again(
     entries: dict[str, Any],
     closures: tuple[LoopClosure, ...],
     points: dict[str, Anchor],
-    numbers: NumbersOfVariants | None,
+    *others: Any,
 ) -> KnownLinkage:
-    return KnownLinkage(tree, check_description(entries, ""), entries, closures, points, numbers)
+    return KnownLinkage(tree, check_description(entries, ""), entries, closures, points, *others)

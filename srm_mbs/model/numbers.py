@@ -30,6 +30,10 @@ def finite_array(
     new
         Whether it is a copy, which changes of ``values`` do not reach.
     """
+    if type(values) is np.ndarray and values.dtype == float and values.shape == shape:
+        if not np.logical_and.reduce(np.isfinite(values), axis=None):
+            return None
+        return values.copy() if new else values
     try:
         given = np.asarray(values)
         if given.dtype.kind == "c":  # NumPy drops imaginary parts with no more than a warning

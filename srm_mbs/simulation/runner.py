@@ -70,7 +70,7 @@ from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
 from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.integration.singular_passages import Bifurcation, find_bifurcations
 from srm_mbs.model.forces import LimitSpring
-from srm_mbs.model.mechanism import per_model, per_start
+from srm_mbs.model.mechanism import per_model, per_start, per_tree
 from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
 from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
 from srm_mbs.simulation.options import (
@@ -966,7 +966,7 @@ def bifurcation_sentences(found: Sequence[Bifurcation]) -> str:
     return "".join(f" {bifurcation}." for bifurcation in found[:DESCRIBED_BIFURCATIONS]) + more
 
 
-@per_model
+@per_tree
 def _limited_joints(mechanism: Mechanism) -> list[tuple[str, int, float, float]]:
     """Name, index in q, least and largest coordinate of the one-degree joints with limits."""
     model = mechanism.model

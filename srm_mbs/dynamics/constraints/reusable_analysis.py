@@ -30,6 +30,7 @@ from srm_mbs.dynamics.constraints.structure import (
     structure_of,
 )
 from srm_mbs.dynamics.scaling import anchor_points, coordinate_units
+from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.mechanism import MechanismData
 
 CHECKED_STEPS = 6
@@ -55,6 +56,8 @@ class ReusableAnalysis:
         Median of the last structural pivot.
     rows, in_use
         The rows of the closures, unscaled, and those that are kept, scaled.
+    loops
+        The closures, if all are between anchors.
     """
 
     structure: Structure
@@ -62,6 +65,7 @@ class ReusableAnalysis:
     last_pivot: float
     rows: DrivenKinematics
     in_use: DrivenKinematics
+    loops: tuple[LoopClosure, ...]
 
     @classmethod
     def of(cls, mechanism: MechanismData) -> ReusableAnalysis | None:
@@ -72,7 +76,9 @@ class ReusableAnalysis:
             return None
         last_pivot = median(walked.last_pivots(structure.rank).tolist())
         rows, in_use = unscaled_rows(mechanism), rows_in_use(mechanism)
-        return cls(structure, walked.largest, last_pivot, rows, in_use)
+        placed = len(rows.places()) == len(mechanism.loops)
+        loops = mechanism.loops if placed else ()
+        return cls(structure, walked.largest, last_pivot, rows, in_use, loops)
 
     def lend_rows(self, mechanism: MechanismData) -> None:
         """Give ``mechanism``, a variant whose tree has the same bodies and joints, the unscaled
@@ -82,7 +88,9 @@ class ReusableAnalysis:
         loops = mechanism.loops
         if not all(loop.anchors for loop in loops):
             return  # couplings have no places
-        rows = self.rows.moved(loops, [loop.resolve(mechanism.model) for loop in loops])
+        known = {id(loop): place for loop, place in zip(self.loops, self.rows.places())}
+        places = [known.get(id(loop)) or loop.resolve(mechanism.model) for loop in loops]
+        rows = self.rows.moved(loops, places)
         if rows is not None:
             unscaled_rows.keep(mechanism, rows)
             anchor_points.keep(mechanism, rows.anchors())

@@ -134,6 +134,8 @@ class Drawing:
         self.points: dict[str, FloatArray] = dict(zip(entry.points, drawn))
         self._places = {name: (x, y) for name, (x, y) in zip(self.points, drawn.tolist())}
         """The points as plain numbers."""
+        self._angles: dict[str, float] = {}
+        """Results of :meth:`body_angle` for bars."""
         self.size = float(np.linalg.norm(np.ptp(drawn, axis=0))) if len(drawn) else 0.0
         """Diagonal (m) of the drawing."""
 
@@ -349,13 +351,16 @@ class Drawing:
         others = [name for name in points if name != point]
         self.bars[bar] = self.bars[bar].model_copy(update={"points": [point, *others]})
         self._shapes[bar] = self._shape(self.bars[bar])
+        self._angles.pop(bar, None)
 
     def body_angle(self, body: str) -> float:
         """Angle (rad) of the x axis of a body as drawn: of a bar, from the first to the second of
         its points; of a slider, that of the bar on which it slides."""
         if body in self.bars:
-            first, second = self.bars[body].points[:2]
-            return direction_angle(self.points[second] - self.points[first])
+            if body not in self._angles:
+                first, second = self.bars[body].points[:2]
+                self._angles[body] = direction_angle(self.points[second] - self.points[first])
+            return self._angles[body]
         on = self.sliders[body].on if body in self.sliders else ""
         return self.body_angle(on) if on else 0.0
 

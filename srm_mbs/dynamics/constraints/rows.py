@@ -331,6 +331,8 @@ class _LoopRows:
         """The same rows of a closure ``name`` between these places; None if they are on other
         bodies."""
         (joint_a, in_a), (joint_b, in_b) = places
+        if in_a is self.in_a and in_b is self.in_b and name == self.name:
+            return self  # no one evaluates these rows, but copies of their workspace
         if joint_a != self.joint_a or joint_b != self.joint_b:
             return None
         other = self.copy_workspace()

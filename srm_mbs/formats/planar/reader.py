@@ -341,7 +341,7 @@ class _Linkage:
             check=self.check,
             parts=plain_parts(bodies, joints) if model is None else None,
             model=model,
-            vary=partial(_variants, self.entry, self.options) if model is None else None,
+            vary=self.variants if model is None else None,
         )
 
     @cached_property
@@ -513,7 +513,13 @@ class _Linkage:
 
     # -- variants ------------------------------------------------------------------------------
 
-    def change(self, places: Sequence[Place]) -> Change | None:
+    def variants(self, places: Sequence[Place]) -> LinkageVariants | None:
+        """The variants whose numbers at ``places`` of the description vary; None where they change
+        more than points, masses and the start."""
+        change = self._change(places)
+        return None if change is None else LinkageVariants(self, change, tuple(places))
+
+    def _change(self, places: Sequence[Place]) -> Change | None:
         """All that the numbers at ``places`` of the description may change; None where that is more
         than points, masses and the start."""
         entry, points, bars, masses = self.entry, set[str](), set[str](), set[str]()
@@ -671,23 +677,13 @@ NUMBERS_OF_BARS = ("length", "mass", "mass_per_length", "inertia", "centre")
 """Keys of a bar whose numbers may vary while the rest of the linkage is kept."""
 
 
-def _variants(
-    entry: PlanarEntry, options: Options, places: Sequence[Place]
-) -> LinkageVariants | None:
-    """The variants of a linkage whose numbers at ``places`` of its description vary; None where
-    they change more than its points, masses and start."""
-    linkage = _Linkage(entry, replace(options, known=None))
-    change = linkage.change(places)
-    return None if change is None else LinkageVariants(linkage, change, tuple(places))
-
-
 class LinkageVariants:
     """The numbers of the variants of a linkage: what they do not change is taken over.
 
     Parameters
     ----------
     linkage
-        The linkage that was read first.
+        The linkage that was read first, translated.
     change
         What they may change.
     places
@@ -696,7 +692,6 @@ class LinkageVariants:
 
     def __init__(self, linkage: _Linkage, change: Change, places: tuple[Place, ...]) -> None:
         self._linkage, self._change, self._places = linkage, change, places
-        linkage.translation()  # which finds all places of points in links
 
     def __call__(self, entry: PlanarEntry) -> Numbers | None:
         """The numbers of a variant with the section ``entry``; None where it has to be read as a
@@ -718,4 +713,6 @@ def _variants_again(
     own: dict[str, Any], cut: tuple[str, ...], places: tuple[Place, ...]
 ) -> LinkageVariants | None:
     entry = PlanarEntry.model_validate(own[PLANAR])
-    return _variants(entry, Options(cut, own, planar=entry), places)
+    linkage = _Linkage(entry, Options(cut, own, planar=entry))
+    linkage.translation()
+    return linkage.variants(places)

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import EvaluationError, EventError, InputError, get_logger, safe_repr
@@ -36,8 +35,7 @@ from srm_mbs.integration.kernel.system import Evaluator
 from srm_mbs.integration.kernel.system import workspace as workspace_of
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
-from srm_mbs.model.numbers import finite_array
-from srm_mbs.simulation.options import RunOptions, numbers, positive
+from srm_mbs.simulation.options import RunOptions, positive
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.runner import (
     check_consistent,
@@ -130,67 +128,6 @@ class Switch:
     mechanism: Mechanism
     q: Any = None
     v: Any = None
-
-
-def impact(
-    mechanism: Mechanism, q: Any, v: Any, normal: Any, restitution: float = 0.0
-) -> FloatArray:
-    """Velocities after an impact that closures take part in.
-
-    An impulse acts along ``normal`` and along the closures, so that the rate n.v turns into
-    -e n.v while G v = 0 stays: v + a mu with a = (1 - P) M^{-1} n (Newton's law of restitution).
-
-    Parameters
-    ----------
-    mechanism
-        What is hit.
-    q : (nq,), v : (nv,)
-        State before.
-    normal : (nv,)
-        n: gradient of the distance to the stop in the coordinates of v.
-    restitution
-        e, from 0 (it stays) to 1 (elastic).
-
-    Returns
-    -------
-    v : (nv,)
-
-    Raises
-    ------
-    InputError
-        For another shape, a restitution that is none, or if the closures do not let the mechanism
-        move along ``normal``.
-    """
-    import pinocchio as pin
-
-    check_mechanism(mechanism)
-    share = finite_array(restitution, ())
-    if share is None or not 0.0 <= share <= 1.0:
-        raise InputError(
-            f"restitution = {safe_repr(restitution)} is not between 0 and 1",
-            element="restitution",
-            remedy="Give 0 (nothing springs back) to 1 (all of it)",
-        )
-    here = mechanism.continued(q, v)
-    remedy = f"Give {here.model.nv} numbers"
-    n = numbers(normal, "normal", remedy)
-    if n.shape != here.v0.shape:
-        raise InputError(
-            f"normal has shape {n.shape}, not {here.v0.shape}", element="normal", remedy=remedy
-        )
-    M = pin.crba(here.model, workspace(here.model), here.q0, pin.Convention.WORLD)
-    along = np.linalg.solve(np.triu(M) + np.triu(M, 1).T, n)
-    terms = make_system(here).evaluate(0.0, np.concatenate([here.q0, here.v0]))
-    free = along - terms.project(along)
-    gain = float(n @ free)
-    if not gain > 1e-12 * float(n @ along):
-        raise InputError(
-            "the closures do not let the mechanism move along this normal",
-            element="normal",
-            remedy="Give the gradient of the gap, which some motion of the mechanism changes",
-        )
-    out: FloatArray = here.v0 - (1.0 + restitution) * float(n @ here.v0) / gain * free
-    return out
 
 
 log = get_logger(__name__)

@@ -37,7 +37,7 @@ def finite_array(
         array: FloatArray = given.astype(float, copy=new)
     except Exception:  # objects may raise anything
         return None
-    fits = shape is None or (
+    fits = shape in (None, array.shape) or (
         len(shape) == array.ndim
         and all(length in (None, actual) for length, actual in zip(shape, array.shape))
     )

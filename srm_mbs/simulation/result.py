@@ -409,11 +409,6 @@ class SimulationResult(RunOutcome):
         return (CompiledObservables if by_kernel else Observables)(self._system)
 
     @property
-    def kernel_system(self) -> Any:
-        """The kernel system that the run keeps, for itself alone; None without one."""
-        return getattr(self._run.dense, "kernel_system", None)
-
-    @property
     def steps_to_save(self) -> StepData:
         """The steps; complete where functions of the user, which are not saved, would be needed to
         read between them."""

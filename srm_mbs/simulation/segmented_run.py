@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -29,10 +29,7 @@ from srm_mbs.integration.events import (
     same_time,
     stop_message,
 )
-from srm_mbs.integration.generated.code import code_of_record
-from srm_mbs.integration.kernel.backend import COMPILED
-from srm_mbs.integration.kernel.system import Evaluator
-from srm_mbs.integration.kernel.system import workspace as workspace_of
+from srm_mbs.integration.kernel.system import Evaluator, SuccessiveWorkspaces
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
 from srm_mbs.simulation.options import RunOptions, positive
@@ -44,6 +41,7 @@ from srm_mbs.simulation.runner import (
     initial_state,
     raise_at_first_call,
     run_segment,
+    run_whole,
     unstarted_segment,
 )
 from srm_mbs.simulation.segmented_result import R, ResultTypes
@@ -306,14 +304,20 @@ def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
         options = options._replace(events=list(options.events))
     checked = checked_options(mechanism, options)
     if acting(options.events):
-        result = _run_segments(mechanism, checked, types)
+        with SuccessiveWorkspaces() as workspaces:
+            result = _run_segments(mechanism, checked, types, workspaces)
     else:
-        result = run_segment(mechanism, checked, types.plain)
+        result = run_whole(mechanism, checked, types.plain)
     result.request = options.repeatable()
     return finished(result, checked)
 
 
-def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
+def _run_segments(
+    mechanism: Mechanism,
+    options: RunOptions,
+    types: ResultTypes[R],
+    workspaces: SuccessiveWorkspaces,
+) -> R:
     """The segments between the actions of events, joined."""
     t_end, nq = options.t_end, mechanism.model.nq
     given = prepare_events(options.events, lambda event: _OfState(event, nq))
@@ -345,7 +349,8 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
     while status is RunStatus.RUNNING:
         try:
             asked = here._replace(events=[event.in_segment() for event in events])
-            part = run_segment(mechanism, asked, types.plain, parts[-1] if parts else None)
+            before = parts[-1] if parts else None
+            part = run_segment(mechanism, asked, types.plain, workspaces, before)
             part.request = asked.repeatable()
             parts.append(part)
             status, t = part.status, part.steps.end
@@ -356,7 +361,10 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
                     due.append(event)
             if status is not RunStatus.EVENT or any(event.left <= 0 for event in due):
                 break
-            mechanism, q, v = _after_actions(events, due, part, here.controller, span, at_once)
+            known = workspaces.evaluator(part.system)
+            mechanism, q, v = _after_actions(
+                events, due, part, known, here.controller, span, at_once
+            )
             last = next((event for event in events if event.left <= 0), None)
             if last is not None:
                 message = stop_message(last.event.name, last.count, t)
@@ -434,6 +442,7 @@ def _act_at_once(
     occurred: list[Occurrence],
     slack: Callable[[_RunEvent], float] = lambda event: 0.0,
     system: Any = None,
+    backend: str = "python",
 ) -> tuple[Mechanism, FloatArray, FloatArray]:
     """Mechanism and state after the actions of ``contacts`` that touch at ``t`` and leave to their
     forbidden side, one after the other until none does (:mod:`srm_mbs.integration.contacts`).
@@ -446,6 +455,8 @@ def _act_at_once(
         Size of the value of an event on its forbidden side that is zero.
     system
         The equations of motion, if they are known.
+    backend
+        Evaluates the closures.
 
     Raises
     ------
@@ -468,7 +479,7 @@ def _act_at_once(
         if event.left <= 0:
             return mechanism, q, v
         structure = mechanism.structure
-        mechanism, q, v = _acted(event, mechanism, t, q, v)
+        mechanism, q, v = _acted(event, mechanism, t, q, v, backend)
         if mechanism.structure is not structure:
             system = None
         event.check_chatter(t, span)
@@ -480,7 +491,7 @@ def _rounding(event: _RunEvent, solution: SimulationResult) -> float:
     return HELD_EVENT_ROUNDING * max(abs(event.value(t, x)) for t, x in zip(solution.t, states))
 
 
-def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
+def _closed(system: OpenSystem | ClosedSystem | Evaluator, t: float, x: FloatArray) -> bool:
     """Whether ``x`` is on the closures to rounding.
 
     A projection would then gain nothing, and next to a singular configuration it would move ``x``
@@ -497,6 +508,7 @@ def _after_actions(
     events: list[_RunEvent],
     due: list[_RunEvent],
     part: SimulationResult,
+    known: OpenSystem | ClosedSystem | Evaluator,
     controller: Callable[..., Any] | None,
     span: float,
     at_once: list[Occurrence],
@@ -514,11 +526,10 @@ def _after_actions(
     near = 2.0 * same_time(*part.steps.times[-2:].tolist())
     nq = mechanism.model.nq
     before = x = np.concatenate([part.q[-1], part.v[-1]])
-    system = part.system if controller is None else make_system(mechanism)
     try:
         # The dense output is on the closures within the tolerance only.
-        if not _closed(system, t, x):
-            x = onto_closures(system, t, x)
+        if not _closed(known, t, x):
+            x = onto_closures(part.system if controller is None else make_system(mechanism), t, x)
     except EvaluationError as error:
         raise EventError(f"no action could be taken: {error}") from error
     for event, times in zip(events, part.t_events or []):
@@ -526,11 +537,12 @@ def _after_actions(
         acted = event in due and event.event.action is not None
         event.begin_instant(acted, 2.0 * abs(event.value(t, x)) if acted else 0.0)
     acting_events = [event for event in events if event.acted]
-    names = ", ".join(event.name for event in acting_events)
-    log.debug("%s: action of %s at t = %.9g s", mechanism.name, names, t)
+    if log.isEnabledFor(logging.DEBUG):
+        names = ", ".join(event.name for event in acting_events)
+        log.debug("%s: action of %s at t = %.9g s", mechanism.name, names, t)
     q, v = x[:nq], x[nq:]
     for event in acting_events:
-        mechanism, q, v = _acted(event, mechanism, t, q, v)
+        mechanism, q, v = _acted(event, mechanism, t, q, v, part.backend)
     switched = mechanism.loops != part.mechanism.loops
     for event in acting_events:
         event.floor = _rounding(event, part) if switched else 0.0
@@ -541,34 +553,18 @@ def _after_actions(
         return 0.0 if x is before else 2.0 * abs(event.value(t, x) - event.value(t, before))
 
     contacts = [event for event in events if event.may_touch]
-    if contacts:
-        with _equations(part) as known:
-            if mechanism.structure is not part.mechanism.structure:
-                known = None
-            return _act_at_once(
-                contacts, mechanism, t, q, v, controller, span, at_once, moved_by, known
-            )
-    return mechanism, q, v
-
-
-@contextmanager
-def _equations(part: SimulationResult) -> Iterator[Any]:
-    """The equations of motion of ``part``, whose closures its kernel evaluates, if it can."""
-    system = part.system
-    if not system.has_constraints or part.backend not in COMPILED:
-        yield system
-    elif part.kernel_system is not None:
-        yield Evaluator(system, part.kernel_system)
-    else:
-        code = code_of_record(part.backend, system.mechanism)
-        with workspace_of(system, code) as kernel_system:
-            yield Evaluator(system, kernel_system)
+    if not contacts:
+        return mechanism, q, v
+    system = known if mechanism.structure is part.mechanism.structure else None
+    return _act_at_once(
+        contacts, mechanism, t, q, v, controller, span, at_once, moved_by, system, part.backend
+    )
 
 
 def _acted(
-    event: _RunEvent, mechanism: Mechanism, t: float, q: FloatArray, v: FloatArray
+    event: _RunEvent, mechanism: Mechanism, t: float, q: FloatArray, v: FloatArray, backend: str
 ) -> tuple[Mechanism, FloatArray, FloatArray]:
-    """Mechanism and state after the action of ``event``.
+    """Mechanism and state after the action of ``event``; ``backend`` evaluates the closures.
 
     Raises
     ------
@@ -585,7 +581,7 @@ def _acted(
         q, v = (np.asarray(part, dtype=float) for part in answer)
         moved = mechanism.continued(q, v)
         if moved.constrained:
-            check_consistent(moved, t)
+            check_consistent(moved, t, backend)
         return moved, moved.q0, moved.v0
     except (InputError, EvaluationError, TypeError, ValueError) as error:
         raise EventError(

@@ -337,14 +337,15 @@ class EventWatch:
         EventError
             If an event function fails, or a state within the step cannot be evaluated.
         """
-        times = [*(t + self._fractions * (t_new - t)).tolist(), t_new]
+        inside = t + self._fractions * (t_new - t)
+        times = [*inside.tolist(), t_new]
         try:
-            states = [*dense(np.array(times[:-1])), end]
+            states = np.concatenate([dense(inside), end[None]])
         except EvaluationError as error:
             raise EventError(f"no event could be looked for within a step: {error}") from error
         found: list[tuple[float, int]] = []
         for i, event in enumerate(self._events):
-            values = [event(at, x.copy()) for at, x in zip(times, states)]
+            values = [event(at, x) for at, x in zip(times, states.copy())]
             nodes = [(t, self._values[i]), *zip(times, values)]
             early = None
             if event.departs and t == self._start and event.counts(rising=values[0] > 0.0):
@@ -385,7 +386,7 @@ class EventWatch:
             if tolerance is None:
                 tolerance = same_time(self._start, nodes[-1][0])
             earliest = self._start + tolerance
-        signs = [sign_above(value, floor) for _, value in nodes[1:]]
+        signs = [float((value > floor) - (value < -floor)) for _, value in nodes[1:]]
         before, self._signs[i] = self._signs[i], signs[-1]
         zeros: list[float] = []
         if signs.count(before) == len(signs):

@@ -414,8 +414,8 @@ def _check_errors(mechanism: Mechanism, t: float, backend: str) -> None:
     if t == 0.0 and not by_kernel:
         g, c = mechanism.initial_errors
     else:
-        errors = closure_errors if by_kernel else constraint_errors
-        g, c = (e[0] for e in errors(mechanism, np.array([t]), q0[None], v0[None]))
+        find = closure_errors if by_kernel else constraint_errors
+        g, c = (e[0] for e in find(mechanism, np.array([t]), q0[None], v0[None]))
     if not len(g):
         return
     units = mechanism.structure.units

@@ -70,7 +70,7 @@ class ContactProbe:
         self, system: System, units: Units, span: float, t: float, state: FloatArray
     ) -> None:
         self._system, self._t, self._state = system, t, state
-        self._scale = np.concatenate([units.coordinate, units.coordinate * units.rate])
+        self._scale = units.state
         self._time = PROBE_TIME * min(1.0 / units.rate, span)
 
     def rounding(self, event: EventFunction, t: float, state: FloatArray) -> float:

@@ -332,6 +332,12 @@ class SimulationResult(RunOutcome):
     def v(self) -> FloatArray:
         return self._nodes[1][:, self.mechanism.model.nq :]
 
+    @property
+    def last_state(self) -> FloatArray:
+        """q and v (nq + nv,) in the last row."""
+        last: FloatArray = self._nodes[1][-1]
+        return last
+
     def _take_events(self, events: tuple[list[FloatArray], list[FloatArray]] | None) -> None:
         """Times and states of the occurrences of each event."""
         self._events = events

@@ -333,16 +333,10 @@ def mechanism_method(method: str | Method, tableau: str | ButcherTableau | None)
     return checked
 
 
-def _units_of_states(mechanism: Mechanism) -> FloatArray:
-    """The unit of each tangent component (2 nv,)."""
-    units = mechanism.structure.units
-    return np.concatenate([units.coordinate, units.coordinate * units.rate])
-
-
 def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArray:
     """Absolute tolerance per tangent component (2 nv,)."""
     if atol is None:
-        tolerance: FloatArray = rtol * _units_of_states(mechanism)
+        tolerance: FloatArray = rtol * mechanism.structure.units.state
         return tolerance
     nv = mechanism.model.nv
     remedy = f"Give one positive number, {nv} (per coordinate) or {2 * nv} (positions, then rates)"
@@ -365,7 +359,7 @@ def error_norm(mechanism: Mechanism, options: RunOptions) -> ErrorNorm:
     if options.atol is None and key in known:
         return known[key]
     atol = absolute_tolerance(mechanism, options.atol, options.rtol)
-    norm = ErrorNorm(atol, options.rtol, options.negligible, _units_of_states(mechanism))
+    norm = ErrorNorm(atol, options.rtol, options.negligible, mechanism.structure.units.state)
     if options.atol is None:
         if len(known) >= KEPT_NORMS:
             known.clear()
@@ -420,10 +414,10 @@ def _check_errors(mechanism: Mechanism, t: float, backend: str) -> None:
         return
     units = mechanism.structure.units
     unit = constraint_units(mechanism, units)
-    speed = max(units.rate, float(np.abs(v0 / units.coordinate).max()))
+    speed = max(units.rate, *np.abs(v0 / units.coordinate).tolist())
     for what, values, limit in (("q0", g, CONSISTENT), ("v0", c, CONSISTENT * speed)):
         errors = np.abs(values) / unit
-        if np.logical_or.reduce(errors > limit):
+        if max(errors.tolist()) > limit:
             worst = int(errors.argmax())
             kind = "drives" if worst >= len(g) - len(mechanism.drives) else "closures"
             raise InputError(

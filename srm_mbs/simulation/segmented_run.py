@@ -526,7 +526,7 @@ def _after_actions(
     # What was counted here is not counted again just after; the rest has still to be.
     near = 2.0 * same_time(*part.steps.times[-2:].tolist())
     nq = mechanism.model.nq
-    before = x = np.concatenate([part.q[-1], part.v[-1]])
+    before = x = part.last_state
     try:
         # The dense output is on the closures within the tolerance only.
         if not _closed(known, t, x):

@@ -108,6 +108,7 @@ class SuccessiveWorkspaces(ExitStack):
         if system is self._system:
             self._kernel_system.renew(**system.constants_of_start())
         else:
+            self._system = None
             self.close()
             self._kernel_system = self.enter_context(workspace(system, code))
             self._system = system

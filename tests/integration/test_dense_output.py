@@ -47,7 +47,7 @@ def test_readings_between_ends_of_steps_err_by_what_is_allowed(name: str) -> Non
     )
     t = np.linspace(0.0, 2.0, 301)
     units = mechanism.structure.units
-    allowed = rtol * units.motion
+    allowed = rtol * units.state
     counts, found = [], []
     for read in (lambda: solution.between_ends(t, allowed), lambda: solution.at(t)):
         before = solution.system.evaluations

@@ -400,8 +400,8 @@ class Readings:
 
     def __init__(self, solution: SimulationResult, allowed: float | None = None) -> None:
         self._solution = solution
-        motion = solution.mechanism.structure.units.motion
-        self._allowed = None if allowed is None else allowed * motion
+        unit = solution.mechanism.structure.units.state
+        self._allowed = None if allowed is None else allowed * unit
         self._known: dict[tuple[int, bytes], SimulationResult] = {}
 
     def __call__(self, run: SimulationResult, times: FloatArray) -> SimulationResult:
@@ -473,7 +473,7 @@ def compare(
     apart, rates = both[:, :nv], both[:, nv:]
     for name, k in _turning_joints(mechanism):
         apart[:, k] = b.joint(name)[0] - a.joint(name)[0]  # unwrapped
-    parts = np.abs(both / mechanism.structure.units.motion)
+    parts = np.abs(both / mechanism.structure.units.state)
     size = np.empty((len(times), 2))
     np.maximum.reduce(parts[:, :nv], axis=1, initial=0.0, out=size[:, 0])
     np.maximum.reduce(parts[:, nv:], axis=1, initial=0.0, out=size[:, 1])

@@ -1,4 +1,4 @@
-// The terms of trees whose joints all turn about an axis or slide along one.
+// The terms of large trees whose joints all turn about an axis or slide along one.
 #pragma once
 
 #include <vector>
@@ -37,7 +37,7 @@ struct AxisBody {
     double moments[6];  // about the centre of mass
 };
 
-// The joints of a model, after one in the place of the ground; none if it has other joints.
+// The joints of a model, after one in the place of the ground; none if it has other joints or few.
 std::vector<AxisJoint> axis_joints(const pinocchio::Model& model);
 
 struct Workspace;

@@ -19,13 +19,17 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
-from srm_mbs._typing import BoolArray, FloatArray, IndexArray
+from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.compiled_rows import ClosureRows, compiled_rows
-from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, loop_rows
+from srm_mbs.dynamics.constraints.geometry import (
+    ClosureGeometry,
+    loop_rows,
+    turning_coordinates,
+)
 from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.constraints.row_algebra import min_norm_solution, smallest_singular_value
 from srm_mbs.dynamics.constraints.rows import support, world_jacobian
-from srm_mbs.dynamics.scaling import coordinate_units, periodic_coordinates, row_angles
+from srm_mbs.dynamics.scaling import coordinate_units, row_angles
 from srm_mbs.dynamics.singularities.local_analysis import refine_singular_point
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.forces import OPEN_LIMIT, LimitSpring
@@ -56,11 +60,6 @@ POLISHING_EVALUATIONS = 61
 """Evaluations of Newton's iteration after it."""
 PERTURBATIONS = (0.05, 0.2, 0.5, 1.0, 1.5, 2.0)
 """Sizes (rad, scene diagonals) of the restarts if the search from the guess itself fails."""
-
-
-@per_model
-def _periodic_coordinates(mechanism: MechanismData) -> BoolArray:
-    return periodic_coordinates(mechanism.model)
 
 
 @per_model
@@ -232,7 +231,7 @@ class ClosureProblem(ClosureGeometry):
         """Indices into q and into v of the periodic angles: a whole turn leads to the same
         configuration.  Those of coupled joints are not among them."""
         coupled = {name for loop in self.mechanism.loops for name in loop.joints or ()}
-        turning = _periodic_coordinates(self.mechanism)
+        turning = turning_coordinates(self.mechanism)
         indices = [
             (joint.idx_q + k, joint.idx_v + k)
             for name, joint in zip(self.mechanism.joint_names, self.model.joints.tolist()[1:])

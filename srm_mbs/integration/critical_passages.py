@@ -664,6 +664,7 @@ class CriticalPassages:
         self._known = self._quiet = False
         self._sigma = self._examine_below = np.inf
         self._rest: PlaceOnCurve | None = None
+        self._found: list[CriticalConfiguration] = []
         self.examined: list[ExaminedPassage] = []
 
     @cached_property
@@ -731,9 +732,13 @@ class CriticalPassages:
         self._examine_below = EXAMINED_AGAIN * self._sigma
         geometry = analysis.geometry(analysis.q0, t)
         place = geometry.at(q, zero)
-        critical = critical_configuration(geometry, analysis.rank, place, SEARCH)
+        critical = critical_configuration(
+            geometry, analysis.rank, place, SEARCH, self._found, ROUNDED_RESIDUAL
+        )
         if critical is None:
             return []
+        if self._one_freedom and not geometry.drives and critical.geometry is geometry:
+            self._found.append(critical)
         begin = geometry.at(analysis.split(state)[0], t)
         left, covered = (geometry.difference(critical.q, x) for x in (place, begin))
         self._known = bool(np.linalg.norm(left) < PASSED * np.linalg.norm(covered))

@@ -29,7 +29,12 @@ from srm_mbs.dynamics.constraints.projection import symmetric
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, all_rows, unscaled_rows
 from srm_mbs.dynamics.constraints.rows import LoopKinematics, world_jacobian
 from srm_mbs.dynamics.constraints.structure import DEPENDENT, ROUNDING_ROW, structure_of
-from srm_mbs.dynamics.scaling import constraint_units, coordinate_units, row_units
+from srm_mbs.dynamics.scaling import (
+    constraint_units,
+    coordinate_units,
+    periodic_coordinates,
+    row_units,
+)
 from srm_mbs.model.drives import in_order_of_rows, positions
 from srm_mbs.model.mechanism import MechanismData, per_model, per_start
 
@@ -272,6 +277,13 @@ class ClosureGeometry:
         """Motion (nv,) from a to b, in units."""
         return pin.difference(self.model, a, b) / self.unit  # type: ignore[no-any-return]
 
+    def in_turns_of(self, q: FloatArray, a: FloatArray) -> FloatArray:
+        """a with the angles that count whole turns turned next to those of q."""
+        periodic = np.flatnonzero(turning_coordinates(self.mechanism))
+        whole = np.zeros(len(self.unit))
+        whole[periodic] = 2.0 * np.pi * np.round(self.difference(a, q)[periodic] / (2.0 * np.pi))
+        return self.move(a, whole)
+
 
 @per_model
 def loop_rows(mechanism: MechanismData) -> LoopKinematics:
@@ -433,3 +445,26 @@ def separated_pattern(mechanism: MechanismData) -> BoolArray:
     driven = np.zeros((len(pattern), 1), dtype=bool)
     driven[rows.driven_rows] = True
     return np.hstack([pattern, driven])
+
+
+@per_model
+def column_groups(mechanism: MechanismData) -> tuple[list[list[int]], BoolArray]:
+    """Which unknowns of :func:`geometry_of` may change together in differences of combinations of
+    the rows of G, and which unknowns (n, n) have a row in common."""
+    pattern = separated_pattern(mechanism)
+    related: BoolArray = pattern.T @ pattern
+    groups: list[list[int]] = []
+    for j, own in enumerate(related):
+        apart = (group for group in groups if not (related[group].any(axis=0) & own).any())
+        group = next(apart, None)
+        if group is None:
+            groups.append([j])
+        else:
+            group.append(j)
+    return groups, related
+
+
+@per_model
+def turning_coordinates(mechanism: MechanismData) -> BoolArray:
+    """:func:`~srm_mbs.dynamics.scaling.periodic_coordinates` of a mechanism."""
+    return periodic_coordinates(mechanism.model)

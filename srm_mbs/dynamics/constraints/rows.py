@@ -65,6 +65,20 @@ def plus_cross(c: Vector, a: Vector, b: Vector) -> Triple:
     return cx + (ay * bz - az * by), cy + (az * bx - ax * bz), cz + (ax * by - ay * bx)
 
 
+def plus_crosses(c: Vector, a: Vector, b: Vector, d: Vector, e: Vector) -> Triple:
+    """c + a x b + d x e."""
+    ax, ay, az = a
+    bx, by, bz = b
+    cx, cy, cz = c
+    dx, dy, dz = d
+    ex, ey, ez = e
+    return (
+        cx + (ay * bz - az * by) + (dy * ez - dz * ey),
+        cy + (az * bx - ax * bz) + (dz * ex - dx * ez),
+        cz + (ax * by - ay * bx) + (dx * ey - dy * ex),
+    )
+
+
 def minus(a: Vector, b: Vector) -> Triple:
     """a - b."""
     ax, ay, az = a
@@ -91,6 +105,19 @@ def from_world(R: Sequence[Vector], a: Vector) -> Triple:
     x, y, z = a
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
     return xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z
+
+
+def position_row(d: Vector, e: Vector, x: Vector, p: Vector, bias: Vector) -> Sequence[float]:
+    """A position row: its (force, moment) = (e, x x e), g = d . p, and Gdot v = d . bias."""
+    dx, dy, dz = d
+    ex, ey, ez = e
+    xx, xy, xz = x
+    px, py, pz = p
+    bx, by, bz = bias
+    return (
+        *(ex, ey, ez, xy * ez - xz * ey, xz * ex - xx * ez, xx * ey - xy * ex),
+        *(dx * px + dy * py + dz * pz, dx * bx + dy * by + dz * bz),
+    )
 
 
 class _JointTerm(NamedTuple):
@@ -339,8 +366,7 @@ class _LoopRows:
         if with_bias:
             spin = a.spin()
             speed = plus_cross(a.velocity(), spin, at_a)
-            bias = plus_cross(a.bias(), a.spin_bias(), at_a)
-            bias = to_world(Ra, plus_cross(bias, spin, speed))
+            bias = to_world(Ra, plus_crosses(a.bias(), a.spin_bias(), at_a, spin, speed))
             if ground:
                 bias = minus(bias, b.bias())  # the ground's is -gravity, as in every body's
                 if self._distances:
@@ -352,14 +378,14 @@ class _LoopRows:
                 # omega_b x (carried + 2 r), r = speed - carried
                 twice = (2.0 * sx - cx, 2.0 * sy - cy, 2.0 * sz - cz)
                 r = sx - cx, sy - cy, sz - cz
-                carried = plus_cross(b.bias(), b.spin_bias(), at_b)
-                bias = minus(from_world(Rb, bias), plus_cross(carried, spin, twice))
+                carried = plus_crosses(b.bias(), b.spin_bias(), at_b, spin, twice)
+                bias = minus(from_world(Rb, bias), carried)
         else:
             r = bias = (0.0, 0.0, 0.0)
         p = minus(at_b, self._at_b)
         for d in self._d:
             e = d if ground else to_world(Rb, d)
-            out += *e, *cross3(x, e), dot(d, p), dot(d, bias)
+            out += position_row(d, e, x, p, bias)
         for length, factor in self._distances:
             apart = math.sqrt(dot(p, p))
             if apart < COINCIDENT * length:

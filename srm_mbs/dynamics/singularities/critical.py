@@ -17,13 +17,14 @@ configuration is a place (q, t).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
+from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, column_groups
 
 ITERATIONS = 12
 DIFFERENCE = 1e-5
@@ -34,8 +35,11 @@ DECIDED = 1e-8
 """Distance at which the residual, which is stationary, is known to rounding."""
 ACCEPTED = 1e-11
 """Size of them from which the search has failed."""
-FROZEN = 1e-3
+FROZEN = 1e-2
 """Newton step (units) from which on the Hessian is not evaluated again."""
+LED = 0.5
+"""Distance from a known critical configuration at which Newton's first step ends, over that of its
+start, below which the search leads there."""
 RIDGE = 1e-5
 """Added to the Hessian, and taken from its counterpart for u: configurations that are critical
 together, such as those of a free base, and combinations that are, such as those of loops that are
@@ -61,29 +65,47 @@ class CriticalConfiguration:
         Independent combinations of the normalised rows.
     u : (rank,)
         The critical combination of them, of unit length.
+    delta
+        u . g, of the normalised rows.
+    searched : (n, n)
+        H next to q, to the accuracy that the search needed.
     """
 
     geometry: ClosureGeometry
     q: FloatArray
     rows: FloatArray
     u: FloatArray
+    delta: float
+    searched: FloatArray
 
     @cached_property
     def hessian(self) -> FloatArray:
         """H (n, n): second derivative of u . g by the coordinates."""
-        return _hessian(self.geometry, self.rows, self.u, self.q)
+        return _hessian(self.geometry, self.weights, self.q)
 
     @cached_property
-    def combination(self) -> FloatArray:
-        """u over the rows of the closures in row units (rows,), of unit length."""
-        weights = (self.u @ self.rows) / self.geometry.row_size
-        out: FloatArray = weights / np.linalg.norm(weights)
+    def weights(self) -> FloatArray:
+        """u over the rows of the closures in row units (rows,)."""
+        out: FloatArray = (self.u @ self.rows) / self.geometry.row_size
         return out
 
     @cached_property
+    def combination(self) -> FloatArray:
+        """``weights``, of unit length."""
+        out: FloatArray = self.weights / np.linalg.norm(self.weights)
+        return out
+
+    @property
     def residual(self) -> float:
         """delta, in row units: relative to the size of the mechanism."""
-        return float(self.combination @ self.geometry.closure(self.q)[0])
+        return self.delta / float(np.linalg.norm(self.weights))
+
+    def in_turns_of(self, q: FloatArray) -> CriticalConfiguration | None:
+        """The same with the whole turns of q (nq,); None if the closures count turns."""
+        turned = self.geometry.in_turns_of(q, self.q)
+        g, G = equations(self.geometry, self.rows, turned)
+        holds = float(np.abs(_equations(g, G, self.u, float(self.u @ g))).max()) < DECIDED
+        return replace(self, q=turned) if holds else None
 
 
 def equations(
@@ -101,21 +123,60 @@ def complement(u: FloatArray) -> FloatArray:
 
 
 def _hessian(
-    geometry: ClosureGeometry, rows: FloatArray, u: FloatArray, q: FloatArray
+    geometry: ClosureGeometry, weights: FloatArray, q: FloatArray, at_q: FloatArray | None = None
 ) -> FloatArray:
-    combination = (u @ rows) / geometry.row_size
+    """The second derivative (n, n) of ``weights`` . g by central differences, or by forward ones
+    from the first derivative ``at_q`` (n,).
+
+    Coordinates that no rows have in common change together."""
+    groups, related = column_groups(geometry.mechanism)
 
     def gradient(e: FloatArray) -> FloatArray:
-        out: FloatArray = combination @ geometry.closure(geometry.move(q, e))[1]
+        out: FloatArray = weights @ geometry.closure(geometry.move(q, e))[1]
         return out
 
-    steps = DIFFERENCE * np.eye(len(geometry.unit))
-    columns = [(gradient(e) - gradient(-e)) / (2.0 * DIFFERENCE) for e in steps]
-    return np.array(columns).T
+    n = len(geometry.unit)
+    out = np.zeros((n, n))
+    for group in groups:
+        e = np.zeros(n)
+        e[group] = DIFFERENCE
+        if at_q is None:
+            change = (gradient(e) - gradient(-e)) / (2.0 * DIFFERENCE)
+        else:
+            change = (gradient(e) - at_q) / DIFFERENCE
+        out[:, group] = np.where(related[:, group], change[:, None], 0.0)
+    return out
+
+
+def _equations(g: FloatArray, G: FloatArray, u: FloatArray, delta: float) -> FloatArray:
+    """(G^T u, g - delta u), which vanishes at a critical configuration."""
+    return np.concatenate([G.T @ u, g - delta * u])
+
+
+def _newton_step(
+    g: FloatArray, G: FloatArray, u: FloatArray, delta: float, H: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The step of (q, u) that keeps the length of u."""
+    rank, n = G.shape
+    size = n + rank
+    matrix, value = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
+    matrix[:n, :n], matrix[:n, n:-1] = H, G.T
+    matrix[n:-1, :n] = G
+    matrix[n:-1, -1], matrix[-1, n:-1] = -u, u
+    own = np.arange(size)
+    matrix[own, own] += np.where(own < n, RIDGE, -(delta + RIDGE))
+    value[:-1] = _equations(g, G, u, delta)
+    step = np.linalg.solve(matrix, -value)
+    return step[:n], step[n:-1]
 
 
 def critical_configuration(
-    geometry: ClosureGeometry, structural_rank: int, q: FloatArray, reach: float
+    geometry: ClosureGeometry,
+    structural_rank: int,
+    q: FloatArray,
+    reach: float,
+    known: Iterable[CriticalConfiguration] = (),
+    singular_to: float = 0.0,
 ) -> CriticalConfiguration | None:
     """The critical configuration near q, found by Newton's iteration for (q, u).
 
@@ -129,49 +190,60 @@ def critical_configuration(
         A configuration, as the geometry takes it; it need not be closed.
     reach
         Largest motion of a coordinate, in units.
+    known
+        Isolated critical configurations of this mechanism, without drives, found before.  The
+        search ends where its first step leads to one of them, or to one but for whole turns.
+    singular_to
+        Residual (row units) up to which the configuration is singular: it is then known well
+        enough where its residual is.
 
     Returns
     -------
     CriticalConfiguration or None
         None if there is none within reach.
     """
-    left = np.linalg.svd(geometry.normalised(q))[0]
-    rows = left[:, :structural_rank].T
+    g, G = geometry.closure(q)
+    size = geometry.row_size
+    rows = np.linalg.svd(G / size[:, None])[0][:, :structural_rank].T
+    g, G = rows @ (g / size), rows @ (G / size[:, None])
     u = np.zeros(structural_rank)
     u[-1] = 1.0
-    n, x, diagonal = len(geometry.unit), q, np.eye(structural_rank)
-    g, G = equations(geometry, rows, x)
     delta = float(u @ g)
-    moved, best, found = np.inf, np.inf, (x, u)
+    weights = (u @ rows) / size
+    for one in known:
+        away = geometry.difference(q, geometry.in_turns_of(q, one.q))
+        if not np.abs(away).max() < reach:
+            continue
+        H = one.searched * np.sign(weights @ one.weights)
+        first, _ = _newton_step(g, G, u, delta, H)
+        if np.linalg.norm(first - away) < LED * np.linalg.norm(away):
+            turned = one.in_turns_of(q)
+            if turned is not None:
+                return turned
+    x, moved, best = q, np.inf, np.inf
+    found: CriticalConfiguration | None = None
     for _ in range(ITERATIONS):
-        value = np.concatenate([G.T @ u, g - delta * u, [0.0]])
-        size = float(np.abs(value).max())
-        if not size < best and size < ACCEPTED:
-            break
-        if size < best:
-            best, found = size, (x, u)
-        if size <= CONVERGED:
+        error = float(np.abs(_equations(g, G, u, delta)).max())
+        if not error < best and error < ACCEPTED:
             break
         if moved > FROZEN:
-            H = _hessian(geometry, rows, u, x) + RIDGE * np.eye(n)
-        matrix = np.zeros((len(value), len(value)))
-        matrix[:n, :n], matrix[:n, n:-1] = H, G.T
-        matrix[n:-1, :n], matrix[n:-1, n:-1] = G, diagonal * -(delta + RIDGE)
-        matrix[n:-1, -1], matrix[-1, n:-1] = -u, u
-        step = np.linalg.solve(matrix, -value)
-        moved = float(np.abs(step[:n]).max())
+            H = _hessian(geometry, (u @ rows) / size, x, G.T @ u)
+        if error < best:
+            best, found = error, CriticalConfiguration(geometry, x, rows, u, delta, H)
+            decided = error <= DECIDED and abs(found.residual) <= singular_to
+            if decided or error <= CONVERGED:
+                return found
+        step, turn = _newton_step(g, G, u, delta, H)
+        moved = float(np.abs(step).max())
         if not moved < reach:
             return None
-        x, u = geometry.move(x, step[:n]), u + step[n:-1]
+        x, u = geometry.move(x, step), u + turn
         u = u / np.linalg.norm(u)
         if not np.abs(geometry.difference(q, x)).max() < reach:
             return None
         g, G = equations(geometry, rows, x)
         delta = float(u @ g)
-    if not best < ACCEPTED:
-        return None
-    x, u = found
-    return CriticalConfiguration(geometry, x, rows, u)
+    return found if best < ACCEPTED else None
 
 
 class CurveThroughSaddle:
@@ -214,13 +286,13 @@ class CurveThroughSaddle:
         if n - rank != 1:
             raise ValueError("the closed configurations are no curves")
         self._strong = complement(critical.u)
-        g, G = equations(geometry, critical.rows, critical.q)
+        _, G = equations(geometry, critical.rows, critical.q)
         plane = np.linalg.svd(self._strong @ G)[2][-2:].T
         form = plane.T @ critical.hessian @ plane
         (low, high), axes = np.linalg.eigh(0.5 * (form + form.T))
         if not (low < 0.0 < high and min(-low, high) > DEFINITE * max(-low, high)):
             raise ValueError("the critical configuration is no saddle")
-        delta = float(critical.u @ g)
+        delta = critical.delta
         # delta > 0: the coordinate of the negative curvature keeps its sign.
         kept, along = (axes[:, 0], axes[:, 1]) if delta > 0.0 else (axes[:, 1], axes[:, 0])
         self._kept, self.along = plane @ kept, plane @ along

@@ -68,14 +68,6 @@ ARRIVAL_SIGMA_CHANGE = 0.2
 further."""
 
 
-def misfit(basis: FloatArray, values: FloatArray) -> tuple[float, FloatArray]:
-    """Norm of the residual of the least-squares fit of ``values``, and its coefficients."""
-    coefficients = np.linalg.lstsq(basis, values, rcond=None)[0]
-    return float(np.linalg.norm(basis @ coefficients - values)), np.asarray(
-        coefficients, dtype=np.float64
-    )
-
-
 def real_roots(p0: float, p1: float, p2: float = 0.0) -> list[float]:
     """Real roots of p0 + p1 x + p2 x^2, ascending."""
     if p2 == 0.0:
@@ -103,20 +95,18 @@ def zero_within(abscissae: FloatArray, sigmas: FloatArray) -> float | None:
         return None
     degree = 2 if len(c) > 4 else 1
     basis = np.vander(c, degree + 1)
-    best, zero = np.inf, None
-    for k in range(1, len(c) + 1):
-        after = float(c[k]) if k < len(c) else 1.1
-        if after <= c[k - 1]:
-            continue
-        signed = np.where(np.arange(len(c)) < k, sigma, -sigma)
-        error, coefficients = misfit(basis, signed)
-        if not error < best:
-            continue
-        for root in real_roots(*coefficients[::-1].tolist()):
-            if c[k - 1] - 0.02 <= root <= after + 0.02:
-                best, zero = error, root
-                break
-    return zero
+    # Column k has the sign of sigma changed behind the first k + 1 abscissae.
+    signed = sigma[:, None] * np.where(np.tri(len(c)).T > 0.0, 1.0, -1.0)
+    fits = np.linalg.lstsq(basis, signed, rcond=None)[0]
+    misfits = np.linalg.norm(basis @ fits - signed, axis=0)
+    ends = [*c.tolist(), 1.1]
+    for k in np.argsort(misfits, kind="stable").tolist():
+        before, after = ends[k], ends[k + 1]
+        if after > before:
+            for root in real_roots(*fits[::-1, k].tolist()):
+                if before - 0.02 <= root <= after + 0.02:
+                    return root
+    return None
 
 
 def zero_ahead(k: int, c: float, sigmas: FloatArray) -> float | None:

@@ -198,12 +198,13 @@ class BranchStages:
 
     def effect_on_rates(self, error: FloatArray, sigma: float, change: float) -> FloatArray:
         """Change (n,) of h times the tangent rate by the normal ``error`` (n,) of a stage."""
-        part = self.system.multiplier_part
+        part, size = self.system.multiplier_part, np.abs(error)
         reach = change / sigma
-        out = np.zeros_like(error)
-        out[part] = 2.0 * reach * np.abs(error[part])
+        of_part = 2.0 * reach * size[part]
         if part.start:
-            out[part] += (reach * reach / self.h) * np.abs(error[: part.start])
+            of_part += (reach * reach / self.h) * size[: part.start]
+        out = np.zeros(len(error))
+        out[part] = of_part
         return out
 
     def rounding(self, sigma: float, change: float, projected: bool) -> FloatArray:

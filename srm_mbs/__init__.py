@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from srm_mbs.api import DaeSolution, Solution, compile, load_solution, simulate, solve_dae
     from srm_mbs.assembly.assemble import Assembly, assemble
     from srm_mbs.dynamics.actuation import actuator_controller
+    from srm_mbs.dynamics.impacts import impact
     from srm_mbs.dynamics.mechanism import Mechanism
     from srm_mbs.errors import (
         AnalysisError,
@@ -61,7 +62,7 @@ if TYPE_CHECKING:
     from srm_mbs.model.pinocchio_constraints import closures_from_pinocchio
     from srm_mbs.simulation.energy_balance import EnergyBalance
     from srm_mbs.simulation.mobility import MobilityMap, mobility_map
-    from srm_mbs.simulation.segmented_run import Event, Switch, impact
+    from srm_mbs.simulation.segmented_run import Event, Switch
     from srm_mbs.simulation.simulator import Simulator
     from srm_mbs.sweeps.results import Sweep
     from srm_mbs.sweeps.sweep import sweep
@@ -81,6 +82,7 @@ _NAMES = {
     "api": "DaeSolution Solution compile load_solution simulate solve_dae",
     "assembly.assemble": "Assembly assemble",
     "dynamics.actuation": "actuator_controller",
+    "dynamics.impacts": "impact",
     "dynamics.mechanism": "Mechanism",
     "errors": "__version__ AnalysisError AssemblyError InputError SimulationError SrmError "
     "SrmWarning",
@@ -103,7 +105,7 @@ _NAMES = {
     "model.pinocchio_constraints": "closures_from_pinocchio",
     "simulation.energy_balance": "EnergyBalance",
     "simulation.mobility": "MobilityMap mobility_map",
-    "simulation.segmented_run": "Event Switch impact",
+    "simulation.segmented_run": "Event Switch",
     "simulation.simulator": "Simulator",
     "sweeps.results": "Sweep",
     "sweeps.sweep": "sweep",

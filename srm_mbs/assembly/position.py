@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,8 @@ AXES_TOLERANCE = 1e-2
 """Largest mismatch of an assembled state: larger ones have axes in the opposite sense."""
 RANK_TOLERANCE = 1e-10
 """Relative singular value below which a direction does not move the closures."""
+SINGULAR_ROUNDING = 1e-13
+"""Singular value of normalised rows below which it is rounding of zero."""
 NEARLY_SINGULAR = 1e-4
 """Singular value below which a closed configuration may be an inaccurate singular one."""
 FAR = 0.5
@@ -58,6 +60,17 @@ STEPS_TOGETHER = 25
 """The same where groups of loops can be closed one by one."""
 POLISHING_EVALUATIONS = 61
 """Evaluations of Newton's iteration after it."""
+KEPT_GROUPS = 64
+"""Mechanisms whose groups of loops are kept: variants have the same."""
+NO_BOUNDS = (-np.inf, np.inf)
+"""Bounds of motions that have none."""
+FIRST_STEP = 0.1
+"""Longest first step (rad, scene diagonals) of Newton's iteration that replaces a trust-region
+solve."""
+CONTRACTED = 1e-9
+"""Step, in the same units, after which the next is rounding."""
+CONTRACTING_STEPS = 8
+"""Steps of that iteration."""
 PERTURBATIONS = (0.05, 0.2, 0.5, 1.0, 1.5, 2.0)
 """Sizes (rad, scene diagonals) of the restarts if the search from the guess itself fails."""
 
@@ -66,7 +79,23 @@ PERTURBATIONS = (0.05, 0.2, 0.5, 1.0, 1.5, 2.0)
 def _compiled_loop_rows(mechanism: MechanismData) -> ClosureRows:
     if not mechanism.drives:
         return compiled_rows(mechanism)
-    return ClosureRows(mechanism.model, loop_rows(mechanism).copy_workspace())
+    return ClosureRows(mechanism.model, loop_rows(mechanism))
+
+
+@lru_cache(maxsize=KEPT_GROUPS)
+def _groups(pattern: bytes, nv: int, counts: tuple[int, ...]) -> list[tuple[list[int], IndexArray]]:
+    """:attr:`ClosureProblem.groups` of loops with these ``counts`` of rows, whose entries may
+    differ from zero where ``pattern`` (rows, nv) is true; nothing may change them."""
+    out: list[tuple[list[int], set[int]]] = []
+    moves, row = np.frombuffer(pattern, dtype=bool).reshape(-1, nv), 0
+    for number, count in enumerate(counts):
+        own = set(np.flatnonzero(moves[row : row + count].any(axis=0)).tolist())
+        numbers, row = [number], row + count
+        for group in [group for group in out if group[1] & own]:
+            out.remove(group)
+            numbers, own = [*group[0], *numbers], group[1] | own
+        out.append((sorted(numbers), own))
+    return [(numbers, np.array(sorted(own), dtype=int)) for numbers, own in out]
 
 
 class ClosureProblem(ClosureGeometry):
@@ -78,6 +107,8 @@ class ClosureProblem(ClosureGeometry):
     _latest: tuple[bytes, FloatArray, FloatArray, FloatArray] | None = None
     _latest_mismatch: tuple[FloatArray, FloatArray] | None = None
     """g of one of them, and the mismatch there."""
+    _latest_smallest: tuple[FloatArray, float] | None = None
+    """G of one of them, and the smallest singular value there."""
 
     def closure(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As of every geometry, by the kernel where there is one; nothing may change the arrays."""
@@ -109,16 +140,10 @@ class ClosureProblem(ClosureGeometry):
 
     @cached_property
     def _unambiguous(self) -> list[IndexArray]:
-        """For each loop, the rows whose only zeros are the intended closed configurations.
-
-        Where a closure matches axes, the zeros of its alignments also have them reversed.
-        """
+        """For each loop, its :attr:`~srm_mbs.model.closures.RowSet.unambiguous` rows."""
         out, first = [], 0
         for loop in self.mechanism.loops:
-            lengths, alignments, joints = loop.rows.blocks
-            own = np.arange(loop.rows.count)
-            turns = own[:0] if len(loop.rows.matched) else own[alignments]
-            out.append(first + np.concatenate([own[lengths], turns, own[joints]]))
+            out.append(first + loop.rows.unambiguous)
             first += loop.rows.count
         return out
 
@@ -138,17 +163,21 @@ class ClosureProblem(ClosureGeometry):
     def groups(self) -> list[tuple[list[int], IndexArray]]:
         """Numbers of the loops, and velocity indices of the coordinates that move them, of the
         smallest groups of loops that share no coordinate: each closes by itself."""
-        out: list[tuple[list[int], set[int]]] = []
-        pattern, row = loop_rows(self.mechanism).pattern(), 0
-        for number, loop in enumerate(self.mechanism.loops):
-            rows = pattern[row : row + loop.rows.count]
-            own, row = set(np.flatnonzero(rows.any(axis=0)).tolist()), row + loop.rows.count
-            numbers = [number]
-            for group in [group for group in out if group[1] & own]:
-                out.remove(group)
-                numbers, own = [*group[0], *numbers], group[1] | own
-            out.append((sorted(numbers), own))
-        return [(numbers, np.array(sorted(own), dtype=int)) for numbers, own in out]
+        pattern = loop_rows(self.mechanism).pattern()
+        counts = tuple(loop.rows.count for loop in self.mechanism.loops)
+        return _groups(pattern.tobytes(), int(self.model.nv), counts)
+
+    def smallest_value(self, q: FloatArray, free: IndexArray | None = None) -> float:
+        """The smallest singular value of the normalised rows at q in the columns ``free``, above
+        rounding; infinite if there is none."""
+        whole = free is None or len(free) == self.model.nv
+        rows = self.normalised(q) if whole else self.normalised(q)[:, free]
+        if not whole:
+            return smallest_singular_value(rows, SINGULAR_ROUNDING)
+        if self._latest_smallest is None or self._latest_smallest[0] is not self.closure(q)[1]:
+            found = smallest_singular_value(rows, SINGULAR_ROUNDING)
+            self._latest_smallest = self.closure(q)[1], found
+        return self._latest_smallest[1]
 
     def part(self, numbers: list[int]) -> ClosureProblem:
         """The closure equations of the loops of these ``numbers``, in the same units."""
@@ -339,11 +368,31 @@ def polish(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArr
     return newton(q, linearise, POLISHING_EVALUATIONS)[0]
 
 
+def _contracted(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray | None:
+    """The closed configuration next to q, if Newton's iteration contracts to it and the closures
+    determine all ``free`` coordinates; else None.
+
+    If no step is longer than half the one before, the iteration ends at the one root within twice
+    the first step (L. V. Kantorovich), which the trust-region solve from q would find, too.
+    """
+    longest = FIRST_STEP
+    for _ in range(CONTRACTING_STEPS):
+        g, G = problem.closure(q)
+        step, _, rank, _ = np.linalg.lstsq(G[:, free], g, rcond=RANK_TOLERANCE)
+        length = float(np.abs(step).max())
+        if rank < len(free) or not length <= longest:
+            return None
+        q, longest = problem.move(q, -step, free), 0.5 * length
+        if length <= CONTRACTED:
+            return q
+    return None
+
+
 def onto_singular_point(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
     """The singular configuration next to q, to round-off (g has a double root there); else q."""
-    rows = problem.normalised(q)[:, free]
-    if not smallest_singular_value(rows, 1e-13) < NEARLY_SINGULAR:
+    if not problem.smallest_value(q, free) < NEARLY_SINGULAR:
         return q
+    rows = problem.normalised(q)[:, free]
     rank = int(np.sum(np.linalg.svd(rows, compute_uv=False) > NEARLY_SINGULAR))
     # A regular configuration close to a singular one is kept: g must not become larger.
     closed = max(2e-15, float(np.abs(problem.closure(q)[0]).max()))
@@ -356,7 +405,7 @@ def close_positions(
     q: FloatArray,
     free: IndexArray,
     steps: int = SEARCH_STEPS,
-    bounds: tuple[Any, Any] = (-np.inf, np.inf),
+    bounds: tuple[Any, Any] = NO_BOUNDS,
 ) -> FloatArray:
     """The result of assembly from q (nq,) over the ``free`` coordinates, closed or not.
 
@@ -365,6 +414,12 @@ def close_positions(
     if np.linalg.norm(problem.mismatch(q)) <= CONSTRAINT_TOLERANCE:
         exact = np.abs(problem.closure(q)[0]).max() <= EXACTLY_CLOSED
         return problem.unwrapped(q if exact else polish(problem, q, free))
+    if bounds is NO_BOUNDS:
+        nearby = _contracted(problem, q, free)
+        if nearby is not None:
+            nearby = polish(problem, nearby, free)
+            if problem.closed(nearby):
+                return problem.unwrapped(nearby)
     for near in (True, False):  # without damping where no configuration near q is closed
         found = polish(problem, _search(problem, q, free, steps, bounds, near=near), free)
         if problem.closed(found):

@@ -76,7 +76,9 @@ def assemble_velocity(
     G = np.concatenate([G, drives.rows])
     prescribed = np.concatenate([np.zeros(len(G) - len(drives.rates)), drives.rates])
     normalised = np.concatenate([problem.normalised(q), drives.rows])
-    smallest = smallest_singular_value(normalised, EXACTLY)
+    smallest = 0.0 if len(drives.rates) else problem.smallest_value(q)
+    if not smallest > EXACTLY:
+        smallest = smallest_singular_value(normalised, EXACTLY)
     conditions, close = _conditions(analysed, problem, q, drives, smallest)
     fastest = float(np.abs(np.concatenate([v / problem.unit, drives.rates])).max())
 
@@ -96,7 +98,8 @@ def assemble_velocity(
     def fit(u: FloatArray, free: IndexArray, to: _Conditions) -> FloatArray | None:
         """The rates nearest to u that satisfy the conditions; None if there are none."""
         u, null = onto_rows(u, free, to)
-        return _onto_tangent(u, free, null, to.curvature)
+        independent = len(free) - null.shape[1] == to.used
+        return _onto_tangent(u, free, null, _no_curvature if independent else to.curvature)
 
     def solve(names: Iterable[str]) -> tuple[FloatArray, float, bool]:
         """Rates in units, the largest G v left, and whether a motion has these rates."""
@@ -157,25 +160,35 @@ def assemble_velocity(
 
 @dataclass(frozen=True, eq=False)
 class _Conditions:
-    """Conditions on the rates u (nv,), in units, of a motion: rows u = right, curvature(u) = 0."""
+    """Conditions on the rates u (nv,), in units, of a motion: rows u = right, curvature(u) = 0,
+    which says nothing where the rows in use, as many as ``used``, are independent."""
 
     rows: FloatArray
     right: FloatArray
     curvature: Callable[[FloatArray], FloatArray]
+    used: int
+
+
+def _no_curvature(_: FloatArray) -> FloatArray:
+    return np.zeros(0)
 
 
 def _with_drives(
-    rows: FloatArray, drives: DriveRows, curvature: Callable[[FloatArray], FloatArray]
+    rows: FloatArray,
+    drives: DriveRows,
+    curvature: Callable[[FloatArray], FloatArray],
+    used: int = -1,
 ) -> _Conditions:
-    """The conditions of the closures, rows u = 0, and of the drives."""
+    """The conditions of the closures, rows u = 0, and of the drives; without ``used``, rows may
+    depend on each other."""
     right = np.concatenate([np.zeros(len(rows)), drives.rates])
-    return _Conditions(np.concatenate([rows, drives.rows]), right, curvature)
+    return _Conditions(np.concatenate([rows, drives.rows]), right, curvature, used)
 
 
 def _on_branch(limit: BranchLimit, unit: FloatArray, drives: DriveRows) -> _Conditions:
     """The conditions on one branch next to a singular configuration: u has no normal part."""
     normal = limit.projector * unit / unit[:, None]
-    return _with_drives(normal, drives, lambda u: np.zeros(0))
+    return _with_drives(normal, drives, _no_curvature)
 
 
 def _conditions(
@@ -201,7 +214,7 @@ def _conditions(
         out: FloatArray = left.T @ np.concatenate([problem.bias(q, u), drives.bias(u)])[used]
         return out
 
-    here = _with_drives(normalised, drives, curvature)
+    here = _with_drives(normalised, drives, curvature, int(np.count_nonzero(used)))
     if not smallest < NEARLY:
         return here, None
     # G determines the rates to round-off over the square of the distance: use the branch.

@@ -545,6 +545,12 @@ class OpenSystem(Mechanics):
             raise EvaluationError("the acceleration is not finite")
         return self._terms
 
+    def impulse_response(self, q: FloatArray, n: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As :meth:`ClosedSystem.impulse_response`, without closures."""
+        U = cholesky(pin.crba(self.model, self.data, q, _WORLD))
+        along = unwhiten(U, whiten(U, n))
+        return along, along
+
     def derivatives(
         self, state: FloatArray, accelerations: FloatArray
     ) -> AccelerationDerivatives | None:
@@ -717,6 +723,21 @@ class ClosedSystem(Mechanics):
         if predicted is not None:
             terms.white_multiplier = projection.completed(terms.white_multiplier, predicted)
         return terms
+
+    def impulse_response(self, q: FloatArray, n: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Changes of the velocities at q (nq,) by an impulse n (nv,): M^-1 n without the closures,
+        and (1 - P) M^-1 n with their impulses.
+
+        Raises
+        ------
+        EvaluationError
+            As :meth:`evaluate`.
+        """
+        loops, p = self.loops, self.projection
+        loops.evaluate(self.model, self.data, q)
+        p.factor(self._mass_matrix, loops.G, n, np.zeros(len(loops.g)), None)
+        white = p.white_force
+        return p.unwhiten(white), p.unwhiten(white - p.Q @ (p.Q.T @ white))
 
     def derivatives(
         self, state: FloatArray, accelerations: FloatArray

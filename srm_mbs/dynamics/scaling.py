@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from typing import NamedTuple
 
@@ -50,6 +51,11 @@ class Units:
     length: float
     coordinate: FloatArray
     rate: float
+
+    @cached_property
+    def state(self) -> FloatArray:
+        """Units (2 nv,) of positions, then of rates."""
+        return np.concatenate([self.coordinate, self.coordinate * self.rate])
 
 
 @per_model

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,8 +33,10 @@ from srm_mbs.errors import (
 from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.plausibility import doubtful_angles, doubtful_inertias
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
-from srm_mbs.formats.translation import TreeParts
+from srm_mbs.formats.toml.parameters import Place
+from srm_mbs.formats.translation import NumbersOfVariants, TreeParts
 from srm_mbs.formats.urdf.parser import UrdfModel, build_urdf, lock_joints
+from srm_mbs.formats.urdf.variants import OverridableTree
 from srm_mbs.formats.variants import Elements
 from srm_mbs.formats.xml import parse_xml
 from srm_mbs.model.anchors import Anchor
@@ -185,7 +187,8 @@ class Reading:
     Attributes
     ----------
     description, entries
-        The checked description, and its tables.
+        The checked description, and its tables; those of a variant may still have the section
+        [planar].
     tree
         Root element of its URDF; building the mechanism changes it.
     source
@@ -200,8 +203,10 @@ class Reading:
         Reads it again with other values of its parameters; None without parameters.
     analysis
         That of another variant of the description, if it is one.
-    parts, model
+    parts, model, vary
         As of :class:`~srm_mbs.formats.translation.Translation`.
+    overridable
+        The numbers of a URDF that its description changes, if variants may change them again.
     elements
         Its elements, where they are not made from the tables of the description.
     """
@@ -218,6 +223,8 @@ class Reading:
     parts: TreeParts | None = None
     model: pin.Model | None = None
     elements: Elements | None = None
+    vary: Callable[[Sequence[Place]], NumbersOfVariants | None] | None = None
+    overridable: OverridableTree | None = None
 
 
 def unassembled(
@@ -240,7 +247,8 @@ def unassembled(
         built = build_urdf(reading.tree, source.urdf_path, source.base, locked, coupled)
     built.model.gravity.linear = np.array(source.gravity)
     description, massless = _with_massless_ends(description, built.model)
-    _check_joint_names(description, built.model)
+    if reading.elements is None:  # others have the names of a variant that was checked
+        _check_joint_names(description, built.model)
     model, q, v, guess = _without_locked(description, built.model)
     if reading.model is None:  # the start of variants decides
         check_inertia(model, source.urdf_path)
@@ -264,26 +272,30 @@ def unassembled(
         *description.force_elements(csv),
         *_compensation(reading, model, np.array(source.gravity)),
     )
-    mechanism = reading.kind(
-        model,
-        description.closures() if elements is None else elements.closures,
-        q0=start,
-        forces=forces,
-        drives=description.drives(csv) if csv else (),
-        friction_speed=friction_speed,
-        name=description.name or model.name,
-        source=source,
-        defaults=SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
-        notes=(
+    parts: dict[str, Any] = {
+        "model": model,
+        "loops": description.closures() if elements is None else elements.closures,
+        "q0": start,
+        "forces": forces,
+        "drives": description.drives(csv) if csv else (),
+        "friction_speed": friction_speed,
+        "name": description.name or model.name,
+        "source": source,
+        "defaults": SimulationDefaults(defaults.t_end, defaults.rtol, defaults.atol),
+        "notes": (
             *reading.notes,
             *built.notes,
             *massless,
             *idle,
             *_friction_note(model, forces, friction_speed),
         ),
-        points=description.named_points() if elements is None else elements.points,
-        actuators=actuators,
-    )
+        "points": description.named_points() if elements is None else elements.points,
+        "actuators": actuators,
+    }
+    if elements is None:
+        mechanism = reading.kind(**parts)
+    else:
+        mechanism = reading.kind.of_checked(elements.tree_results, **parts)
     if description.limits == "spring":
         mechanism = _with_limit_springs(mechanism)
     return mechanism, q, v

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from numbers import Integral
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import tomli_w
@@ -21,11 +22,12 @@ from srm_mbs.formats.build import Reading, assembled
 from srm_mbs.formats.document import Document, RepeatedDocument
 from srm_mbs.formats.registry import DESCRIPTION, LINKAGE, Format, find_format, of_key
 from srm_mbs.formats.toml.description import Description, check_description
-from srm_mbs.formats.toml.parameters import given_parameters, resolved
-from srm_mbs.formats.translation import KnownTree, Options, merged
+from srm_mbs.formats.toml.parameters import Place, expressions, given_parameters, resolved
+from srm_mbs.formats.translation import KnownTree, Options, TreeParts, merged
 from srm_mbs.formats.urdf.override import override, without_overrides
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
-from srm_mbs.formats.variants import KnownLinkage
+from srm_mbs.formats.urdf.variants import OverridableTree
+from srm_mbs.formats.variants import VARYING, KnownLinkage
 from srm_mbs.model.mechanism import Source, SourceTexts, variant_maker
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array, name_list
 from srm_mbs.model.reach import Reach
@@ -135,7 +137,7 @@ def _translated(
     tree = None if known is None else known.tree
     options = Options(cut, entries, reach, keyframe, base, description.planar, tree)
     translation = found.translate(model, options)
-    given, as_read = overrides.entries(), bool(own.text)
+    given, as_read, overridable = overrides.entries(), bool(own.text), None
     if description.override:
         if found is LINKAGE:
             raise InputError(
@@ -144,6 +146,8 @@ def _translated(
                 element="override",
                 remedy='Give its points and masses expressions, as "=2*crank"',
             )
+        if found.key == "urdf" and not translation.entries:
+            overridable = OverridableTree.of(translation.tree, description.override, model.file)
         override(translation.tree, description.override, own.file, model.file)
         translation = replace(translation, write=None)  # the text of the changed tree
         entries, as_read = without_overrides(entries), False
@@ -182,6 +186,50 @@ def _translated(
         parts=translation.parts,
         model=translation.model,
         elements=elements,
+        vary=translation.vary,
+        overridable=overridable,
+    )
+
+
+def _varied(
+    own: Document,
+    entries: Mapping[str, Any],
+    given: Description,
+    overrides: Overrides,
+    reach: Reach,
+    urdf: str | None,
+    known: KnownLinkage,
+) -> Reading | None:
+    """A variant of which nothing but numbers is read; None where it has to be read as a whole.  Its
+    texts are made as those of others when they are asked for."""
+    found = known.varied(given, entries)
+    if found is None:
+        return None
+
+    @cache
+    def whole() -> Source:
+        return _of_tables(own, entries, given, overrides, reach, urdf, None)[0].source
+
+    description = found.elements.description
+    gravity = description.gravity if overrides.gravity is None else overrides.gravity
+    source = Source(
+        SourceTexts(lambda: whole().description, lambda: whole().urdf),
+        urdf_path=known.urdf_path,
+        path=own.file,
+        base=description.base if overrides.base is None else overrides.base,
+        gravity=_gravity(gravity),
+        format=known.format,
+        reach=reach,
+    )
+    return Reading(
+        description,
+        entries,
+        Element("robot"),
+        source,
+        (*own.notes, *found.notes),
+        None if known.numbers is None else known.numbers.check,
+        model=found.model,
+        elements=found.elements,
     )
 
 
@@ -254,6 +302,11 @@ def _of_tables(
 ) -> tuple[Reading, str | None]:
     """Read what a description, whose tables are checked, consists of or names; with the text of its
     model file."""
+    varied = None
+    if known is not None and not overrides.entries():
+        varied = _varied(own, entries, description, overrides, reach, urdf, known)
+    if varied is not None:
+        return varied, None
     if description.planar is not None:
         read = _translated(own, entries, description, LINKAGE, own, overrides, reach, known)
         return read, None
@@ -295,26 +348,48 @@ def mechanism_of(reading: Reading) -> Mechanism:
         variants = replace(
             reading.variants,
             analysis=ReusableAnalysis.of(mechanism),
-            known=_known_linkage(reading, mechanism),
+            known=_known_linkage(reading, mechanism, reading.variants.own),
             kind=reading.kind,
         )
         variant_maker.keep(mechanism, variants)
     return mechanism
 
 
-def _known_linkage(reading: Reading, mechanism: Mechanism) -> KnownLinkage | None:
+def _known_linkage(reading: Reading, mechanism: Mechanism, own: Document) -> KnownLinkage | None:
     """A mechanism for its variants; None where more than its numbers made its tree, or where its
     variants need the URDF itself."""
     description, model = reading.description, mechanism.model
     changed = description.lock or description.massless != "refused" or model.armature.any()
-    if reading.parts is None or changed or description.gravity_compensation:
+    if changed or description.gravity_compensation:
         return None
-    tree = KnownTree(reading.parts, model)
+    parts, overridable = reading.parts, reading.overridable
+    if mechanism.notes != reading.notes or not _are_overridden(expressions(own.toml)):
+        overridable = None  # what the check of the file notes may be about its numbers
+    if parts is None and overridable is None:
+        return None
+    tree = KnownTree(parts or TreeParts((), ()), model, mechanism.tree_results)
     # Variants take over the rows of those that the mechanism has as they are described.
     kept = {loop.name: loop for loop in mechanism.loops}
     described = description.closures()
     closures = tuple(kept[one.name] if kept.get(one.name) == one else one for one in described)
-    return KnownLinkage(tree, description, reading.entries, closures, mechanism.points)
+    numbers = None if reading.vary is None else reading.vary(expressions(own.toml))
+    return KnownLinkage(
+        tree,
+        description,
+        reading.entries,
+        closures,
+        mechanism.points,
+        numbers,
+        overridable,
+        reading.source.urdf_path,
+        reading.source.format,
+    )
+
+
+def _are_overridden(places: Iterable[Place]) -> bool:
+    """Whether all numbers at ``places`` are those of ``[[override]]``, or of elements that are
+    compared with those of the known mechanism."""
+    return all(key in ("override", *VARYING) for key, *_ in places)
 
 
 def _of_file(path: Path, overrides: Overrides) -> Reading:

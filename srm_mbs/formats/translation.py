@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any, NamedTuple
+from functools import cached_property, partial
+from typing import Any, NamedTuple, Protocol
 from xml.etree.ElementTree import Element, indent, tostring
 
 import pinocchio as pin
 
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.formats.graph.joint_graph import Body, Joint
+from srm_mbs.formats.toml.parameters import Place
 from srm_mbs.formats.toml.schema import PlanarEntry
 from srm_mbs.model.reach import Reach
 
@@ -60,6 +61,32 @@ class TreeParts(NamedTuple):
     joints: Sequence[Joint]
 
 
+class Numbers(NamedTuple):
+    """The numbers of a variant that may differ from those of the mechanism that was read first.
+
+    Attributes
+    ----------
+    joints, inertias
+        Joints of the tree that may have another place, and inertias of links by name.
+    closures, points
+        Tables of both anchors of closures, and of the anchors of points, by name.
+    forces
+        Tables of the anchors of forces, by name and key.
+    initial
+        The table ``initial``.
+    notes
+        As of a :class:`Translation`.
+    """
+
+    joints: Sequence[Joint]
+    inertias: Mapping[str, pin.Inertia]
+    closures: Mapping[str, tuple[dict[str, Any], dict[str, Any]]]
+    points: Mapping[str, dict[str, Any]]
+    forces: Mapping[str, dict[str, dict[str, Any]]]
+    initial: dict[str, Any]
+    notes: tuple[str, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class KnownTree:
     """The tree of a mechanism, whose variants may have the same links and joints.
@@ -70,16 +97,40 @@ class KnownTree:
         Its bodies and joints (:attr:`Translation.parts`).
     model
         Pinocchio's model.
+    results
+        What follows from the tree alone
+        (:attr:`~srm_mbs.model.mechanism.MechanismData.tree_results`).
     """
 
     parts: TreeParts
     model: pin.Model
+    results: dict[Any, Any]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Without results, whose functions may not be pickled."""
+        return KnownTree, (self.parts, self.model, {})
+
+    @cached_property
+    def numbers(self) -> dict[str, int]:
+        """Pinocchio's number of the joint that carries each link, by the name of the link."""
+        return {joint.child: self.model.getJointId(joint.name) for joint in self.parts.joints}
 
 
 def urdf_text(tree: Element) -> str:
     """The text of a URDF, indented."""
     indent(tree)
     return tostring(tree, encoding="unicode") + "\n"
+
+
+class NumbersOfVariants(Protocol):
+    """Finds the numbers of variants of a linkage."""
+
+    def __call__(self, entry: PlanarEntry) -> Numbers | None:
+        """The numbers of a variant from its section ``[planar]``; None where it has to be read as a
+        whole, because of a fault perhaps."""
+
+    def check(self, mechanism: Mechanism) -> None:
+        """As of a :class:`Translation`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +159,9 @@ class Translation:
         from their tree, or made from another.
     model
         Pinocchio's model, if it was made from that of a :class:`KnownTree`: ``tree`` is empty.
+    vary
+        Makes the numbers of variants from their sections ``[planar]``, for those whose numbers at
+        some places of the description differ; None for places that change more.
     """
 
     tree: Element
@@ -118,6 +172,7 @@ class Translation:
     check: Callable[[Mechanism], None] | None = None
     parts: TreeParts | None = None
     model: pin.Model | None = None
+    vary: Callable[[Sequence[Place]], NumbersOfVariants | None] | None = None
 
     def __post_init__(self) -> None:
         if self.write is None:  # building the mechanism changes the tree
@@ -177,13 +232,13 @@ def merged(own: Mapping[str, Any], entries: Mapping[str, Any], urdf: str) -> dic
         elif key in TABLES:
             out[key] = {**entries.get(key, {}), **own.get(key, {})}
         elif key == "initial":
-            out[key] = _merged_initial(own.get(key, {}), entries.get(key, {}))
+            out[key] = merged_initial(own.get(key, {}), entries.get(key, {}))
         else:
             out[key] = own[key] if key in own else entries[key]
     return out
 
 
-def _merged_initial(own: Mapping[str, Any], entries: Mapping[str, Any]) -> dict[str, Any]:
+def merged_initial(own: Mapping[str, Any], entries: Mapping[str, Any]) -> dict[str, Any]:
     """Joint by joint; a position that the description gives replaces a held or guessed one."""
     placed = {*own.get("q", ()), *own.get("guess", ())}
     out: dict[str, Any] = {}

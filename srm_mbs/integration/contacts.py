@@ -14,7 +14,7 @@ rounding of the value, its change when time and state change by rounding, are ze
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -52,7 +52,7 @@ class Contact:
 
 
 class ContactProbe:
-    """Examines contacts.
+    """Examines contacts at a time and a state.
 
     Parameters
     ----------
@@ -62,56 +62,61 @@ class ContactProbe:
         Units of the mechanism.
     span
         Length of the run (s).
+    t, state
+        The time (s) and the state (nx,).
     """
 
-    def __init__(self, system: System, units: Units, span: float) -> None:
-        self._system = system
-        self._scale = np.concatenate([units.coordinate, units.coordinate * units.rate])
+    def __init__(
+        self, system: System, units: Units, span: float, t: float, state: FloatArray
+    ) -> None:
+        self._system, self._t, self._state = system, t, state
+        self._scale = units.state
         self._time = PROBE_TIME * min(1.0 / units.rate, span)
 
-    def rounding(
-        self, event: EventFunction, t: float, state: FloatArray, value: float | None = None
-    ) -> float:
-        """Change of the ``value`` of ``event`` at ``t`` (s) and ``state`` (nx,) when they change by
-        rounding.
+    def rounding(self, event: EventFunction, t: float, state: FloatArray) -> float:
+        """Change of the value of ``event`` at ``t`` (s) and ``state`` (nx,), which may be others,
+        when they change by rounding.
 
         Raises
         ------
         EventError
             If the event function fails; so does :meth:`contact`.
         """
-        here = event(t, state.copy()) if value is None else value
-        changes = []
-        size = self._scale.size
-        for signs in _signs(max(size, state.size)):
-            scaled = state * (1.0 + VALUE_ROUNDING * signs[: state.size])
-            x = self._system.retract(scaled, VALUE_ROUNDING * self._scale * signs[:size])
-            changes.append(event(t * (1.0 - VALUE_ROUNDING), x) - here)
-        return max(map(abs, changes))
+        return _largest_change(event, t, self._rounded(state), event(t, state.copy()))
 
-    def _rates(self, t: float, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Velocity and acceleration (nv,); zero for an acceleration that cannot be evaluated, or
-        that is not accurate, next to a singular configuration."""
-        nv = self._system.multiplier_size
+    def _rounded(self, state: FloatArray) -> list[FloatArray]:
+        """``state`` changed by rounding in several directions."""
+        size, retract = self._scale.size, self._system.retract
+        changes = _changes(max(size, state.size))
+        scaled = state * (1.0 + changes[:, : state.size])
+        return list(map(retract, scaled, self._scale * changes[:, :size]))
+
+    @cached_property
+    def _beside(self) -> list[FloatArray]:
+        return self._rounded(self._state)
+
+    @cached_property
+    def _ahead(self) -> list[tuple[float, FloatArray]]:
+        """The two times (s), and the states there, of the motion from here; without acceleration
+        where that cannot be evaluated, or is not accurate, next to a singular configuration."""
+        t, state, system = self._t, self._state, self._system
+        nv, retract = system.multiplier_size, system.retract
         v, a = state[-nv:], np.zeros(nv)
         try:
-            terms = self._system.evaluate(t, state)
+            terms = system.evaluate(t, state)
             if terms.sigma > LARGEST_ZONE_SIGMA:
-                a = terms.rate()[nv:].copy()
+                a = terms.rate()[nv:]
         except EvaluationError:
             pass
-        return v, a
+        return [
+            (t + d, retract(state, np.concatenate([d * v + 0.5 * d**2 * a, d * a])))
+            for d in (self._time, 2.0 * self._time)
+        ]
 
     def contact(
-        self,
-        event: EventFunction,
-        t: float,
-        state: FloatArray,
-        zero: float,
-        slack: float,
-        floor: float,
+        self, event: EventFunction, zero: float, slack: float, floor: float
     ) -> Contact | None:
-        """The contact of ``event`` at ``t`` (s) and ``state`` (nx,); None if it does not touch.
+        """The contact of ``event``; None if it does not touch.
 
         Parameters
         ----------
@@ -120,17 +125,12 @@ class ContactProbe:
         floor
             Size of changes that are rounding, whatever the rounding of the value.
         """
-        value = event(t, state.copy())
-        rounding = max(self.rounding(event, t, state, value), floor)
+        value = event(self._t, self._state.copy())
+        rounding = max(_largest_change(event, self._t, self._beside, value), floor)
         forbidden = event.direction * value > 0.0
         if abs(value) > max(rounding, zero, slack if forbidden else 0.0):
             return None
-        v, a = self._rates(t, state)
-        near, far = (
-            event(t + d, self._system.retract(state, np.concatenate([d * v + half * a, d * a])))
-            - value
-            for d, half in ((k * self._time, 0.5 * (k * self._time) ** 2) for k in (1.0, 2.0))
-        )
+        near, far = (event(t, x.copy()) - value for t, x in self._ahead)
         first, second = 2.0 * near - 0.5 * far, 0.5 * far - near
         allowed = -1.0 if event.direction > 0.0 else 1.0
         resting = max(rounding, RESTING_SHARE * abs(second))
@@ -139,10 +139,18 @@ class ContactProbe:
         return Contact(rate or departs, rate)
 
 
+def _largest_change(
+    event: EventFunction, t: float, rounded: list[FloatArray], value: float
+) -> float:
+    """The largest change of the ``value`` of ``event`` when ``t`` (s) and the state change by
+    rounding."""
+    early = t * (1.0 - VALUE_ROUNDING)
+    return max([abs(event(early, x.copy()) - value) for x in rounded])
+
+
 @lru_cache(maxsize=64)
-def _signs(size: int) -> FloatArray:
-    """Signs (k, size) of changes by rounding; any two numbers change apart in one of the rows."""
+def _changes(size: int) -> FloatArray:
+    """Relative changes (k, size) by rounding; any two numbers change apart in one of the rows."""
     numbers = np.arange(size)
-    return np.array(
-        [1.0 - 2.0 * (numbers >> bit & 1) for bit in range(max(size - 1, 1).bit_length())]
-    )
+    bits = range(max(size - 1, 1).bit_length())
+    return VALUE_ROUNDING * np.array([1.0 - 2.0 * (numbers >> bit & 1) for bit in bits])

@@ -108,6 +108,7 @@ def gauss_nodes(count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     return x, w, 0.5 * legendre.legval(y, integral.T).T @ basis
 
 
+@lru_cache(maxsize=16)
 def node_count(rtol: float) -> int:
     """Collocation nodes of a panel, an even number."""
     return 2 * int(np.ceil(0.5 - 0.3 * np.log10(rtol)))

@@ -337,14 +337,15 @@ class EventWatch:
         EventError
             If an event function fails, or a state within the step cannot be evaluated.
         """
-        times = [*(t + self._fractions * (t_new - t)).tolist(), t_new]
+        inside = t + self._fractions * (t_new - t)
+        times = [*inside.tolist(), t_new]
         try:
-            states = [*dense(np.array(times[:-1])), end]
+            states = np.concatenate([dense(inside), end[None]])
         except EvaluationError as error:
             raise EventError(f"no event could be looked for within a step: {error}") from error
         found: list[tuple[float, int]] = []
         for i, event in enumerate(self._events):
-            values = [event(at, x.copy()) for at, x in zip(times, states)]
+            values = [event(at, x) for at, x in zip(times, states.copy())]
             nodes = [(t, self._values[i]), *zip(times, values)]
             early = None
             if event.departs and t == self._start and event.counts(rising=values[0] > 0.0):
@@ -385,19 +386,19 @@ class EventWatch:
             if tolerance is None:
                 tolerance = same_time(self._start, nodes[-1][0])
             earliest = self._start + tolerance
-        zeros = []
-        for left, right in pairwise(nodes):
-            before, now = self._signs[i], sign_above(right[1], floor)
-            self._signs[i] = now
-            if now == before:
-                continue
-            if before == 0.0:
-                if event.rests is not None and event.counts(rising=now > 0.0):
-                    zeros.append(_end_of_rest(event, dense, left[0], right[0], floor))
-                continue
-            zero = right[0] if now == 0.0 else _zero_between(event, dense, left, right)
-            if zero > earliest and event.counts(rising=before < 0.0):
-                zeros.append(zero)
+        signs = [float((value > floor) - (value < -floor)) for _, value in nodes[1:]]
+        before, self._signs[i] = self._signs[i], signs[-1]
+        zeros: list[float] = []
+        if signs.count(before) == len(signs):
+            return zeros
+        for (left, right), now in zip(pairwise(nodes), signs):
+            if now != before and before != 0.0:
+                zero = right[0] if now == 0.0 else _zero_between(event, dense, left, right)
+                if zero > earliest and event.counts(rising=before < 0.0):
+                    zeros.append(zero)
+            elif now != before and event.rests is not None and event.counts(rising=now > 0.0):
+                zeros.append(_end_of_rest(event, dense, left[0], right[0], floor))
+            before = now
         return zeros
 
     def _record(
@@ -443,17 +444,14 @@ def _with_vertices(
     """``nodes``, equally spaced, with the vertices of parabolas that come near zero between."""
     extra = []
     for (_, a), (t, b), (t_next, c) in zip(nodes, nodes[1:], nodes[2:]):
-        sign = sign_above(b, 0.0)
+        if b < 0.0:
+            a, b, c = -a, -b, -c
         curvature = 0.5 * (a + c) - b
-        if not (sign * a > 0.0 and sign * c > 0.0 and sign * curvature > 0.0):
+        if not (a > 0.0 and b > 0.0 and c > 0.0 and curvature > 0.0):
             continue
         vertex = -0.25 * (c - a) / curvature
-        lowest = sign * (b - curvature * vertex**2)
-        if (
-            abs(vertex) < 1.0
-            and vertex != 0.0
-            and lowest < VERTEX_VALUE * min(abs(a), abs(b), abs(c))
-        ):
+        lowest = b - curvature * vertex**2
+        if abs(vertex) < 1.0 and vertex != 0.0 and lowest < VERTEX_VALUE * min(a, b, c):
             at = t + vertex * (t_next - t)
             extra.append((at, _value_at(event, dense, at)))
     return sorted([*nodes, *extra]) if extra else nodes

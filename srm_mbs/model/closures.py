@@ -32,7 +32,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
-from srm_mbs._typing import FloatArray
+from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
 from srm_mbs.model.numbers import checked_name, finite_number, finite_numbers, plain, unit_vector
@@ -122,6 +122,15 @@ class RowSet:
         lengths = len(self.directions) + len(self.distances)
         joints = lengths + len(self.alignments)
         return slice(0, lengths), slice(lengths, joints), slice(joints, self.count)
+
+    @cached_property
+    def unambiguous(self) -> IndexArray:
+        """The rows whose only zeros are the intended closed configurations: where the closure
+        matches axes, the zeros of its alignments also have them reversed."""
+        lengths, alignments, joints = self.blocks
+        own = np.arange(self.count)
+        turns = own[:0] if len(self.matched) else own[alignments]
+        return np.concatenate([own[lengths], turns, own[joints]])
 
     def without(self, labels: Collection[str]) -> RowSet:
         """The same rows but those called ``labels``."""

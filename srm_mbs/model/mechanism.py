@@ -166,9 +166,10 @@ class SimulationDefaults:
 
 
 class ResultOwner:
-    """Base of :class:`MechanismData`: holds the results of :class:`per_model` and
-    :class:`per_start`, by function."""
+    """Base of :class:`MechanismData`: holds the results of :class:`per_tree`, :class:`per_model`
+    and :class:`per_start`, by function."""
 
+    _tree_results: dict[Any, Any]
     _model_results: dict[Any, Any]
     _start_results: dict[Any, Any]
 
@@ -205,6 +206,16 @@ class _Memoised(Generic[Owner, Result]):
     def keep(self, mechanism: Owner, result: Result) -> None:
         """Use ``result`` instead of computing it."""
         getattr(mechanism, self._store)[self] = result
+
+
+class per_tree(_Memoised[Owner, Result]):  # noqa: N801 - a decorator
+    """Decorator: as :class:`per_model`, once for all variants whose models are copies with other
+    placements and inertias (:meth:`MechanismData.of_checked`).
+
+    The result must depend on neither of them, nor on numbers of closures and forces.
+    """
+
+    _store = "_tree_results"
 
 
 class per_model(_Memoised[Owner, Result]):  # noqa: N801 - a decorator
@@ -298,8 +309,34 @@ class MechanismData(ResultOwner):
 
     def _forget(self) -> None:
         """Begin without results."""
+        object.__setattr__(self, "_tree_results", {})
         object.__setattr__(self, "_model_results", {})
         object.__setattr__(self, "_start_results", {})
+
+    @property
+    def tree_results(self) -> dict[Any, Any]:
+        """The results of :class:`per_tree`, for :meth:`of_checked`."""
+        return self._tree_results
+
+    @classmethod
+    def of_checked(cls, tree_results: dict[Any, Any], **values: Any) -> Self:
+        """A mechanism with these fields, whose parts were checked together: as those of another
+        one, with other numbers.
+
+        Parameters
+        ----------
+        tree_results
+            Those of the other one, of whose model ``values["model"]`` is a copy.
+        """
+        made = object.__new__(cls)
+        made._forget()
+        set_ = object.__setattr__
+        set_(made, "_tree_results", tree_results)
+        for name, value in values.items():
+            set_(made, name, value)
+        made._take_start(values["q0"], np.zeros(made.model.nv))
+        set_(made, "loops", tuple(loop.measured(made.model, made.q0) for loop in made.loops))
+        return made
 
     def with_loop(self, loop: LoopClosure) -> Self:
         """The same mechanism with one more closure, for :class:`srm_mbs.Switch`.
@@ -520,7 +557,7 @@ class MechanismData(ResultOwner):
         )
 
 
-@per_model
+@per_tree
 def _joint_names(mechanism: MechanismData) -> tuple[str, ...]:
     return tuple(vector_elements(mechanism.model.names)[1:])
 

@@ -332,6 +332,12 @@ class SimulationResult(RunOutcome):
     def v(self) -> FloatArray:
         return self._nodes[1][:, self.mechanism.model.nq :]
 
+    @property
+    def last_state(self) -> FloatArray:
+        """q and v (nq + nv,) in the last row."""
+        last: FloatArray = self._nodes[1][-1]
+        return last
+
     def _take_events(self, events: tuple[list[FloatArray], list[FloatArray]] | None) -> None:
         """Times and states of the occurrences of each event."""
         self._events = events
@@ -407,11 +413,6 @@ class SimulationResult(RunOutcome):
         """Quantities at many states of the mechanism, by the backend of the run."""
         by_kernel = self.backend in COMPILED and core is not None
         return (CompiledObservables if by_kernel else Observables)(self._system)
-
-    @property
-    def kernel_system(self) -> Any:
-        """The kernel system that the run keeps, for itself alone; None without one."""
-        return getattr(self._run.dense, "kernel_system", None)
 
     @property
     def steps_to_save(self) -> StepData:

@@ -8,7 +8,6 @@ run with event actions, a rerun with another accuracy; :func:`srm_mbs.solve_dae`
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, TypeVar, cast
@@ -53,9 +52,9 @@ from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend, code_is
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
 from srm_mbs.integration.kernel.marshalling import state_from
-from srm_mbs.integration.kernel.observables import CompiledObservables
+from srm_mbs.integration.kernel.observables import closure_errors
 from srm_mbs.integration.kernel.run import CompiledRun, first_stage
-from srm_mbs.integration.kernel.system import Evaluator, shared, workspace
+from srm_mbs.integration.kernel.system import Evaluator, SuccessiveWorkspaces, shared
 from srm_mbs.integration.messages import (
     MECHANISM,
     ProblemVocabulary,
@@ -70,7 +69,7 @@ from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
 from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.integration.singular_passages import Bifurcation, find_bifurcations
 from srm_mbs.model.forces import LimitSpring
-from srm_mbs.model.mechanism import per_model, per_start
+from srm_mbs.model.mechanism import per_model, per_start, per_tree
 from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
 from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
 from srm_mbs.simulation.options import (
@@ -152,8 +151,6 @@ class Problem:
         Looks for the events; None without any.
     passages
         Examines passages of singular configurations; None where steps make them all.
-    kernel_system
-        The kernel system of the segment before, if it serves this one; None otherwise.
     stream
         Takes the steps of a run with output times; None without them.
     last_step
@@ -177,7 +174,6 @@ class Problem:
     watch: EventWatch | None
     passages: CriticalPassages | None
     held_watch: HeldForceWatch | None = None
-    kernel_system: Any = None
     stream: OutputStream | None = None
     last_step: float = 0.0
     stiff: bool = False
@@ -189,9 +185,10 @@ def run_segment(
     mechanism: Mechanism,
     options: RunOptions,
     result_type: type[Result],
+    workspaces: SuccessiveWorkspaces,
     before: SimulationResult | None = None,
 ) -> Result:
-    """A run without event actions.
+    """A segment of a run, between the actions of events.
 
     Parameters
     ----------
@@ -199,19 +196,27 @@ def run_segment(
         From :func:`checked_options`.
     result_type
         Class of the result.
+    workspaces
+        Kernel systems of the segments.
     before
         The segment that this one continues; its equations of motion serve this one, too, unless the
         mechanism was switched.
     """
     problem = assemble_problem(mechanism, options, before)
     log_start(mechanism.name, options, problem.norm, problem.backend)
-    record, counters, kernel_system = integrate_problem(problem)
+    record, counters, kernel_system = integrate_problem(problem, workspaces)
     if before is None:
         raise_at_first_call(record.error, options.t0)
     lead_with_cause(problem, record)
     result = assemble_result(problem, record, counters, kernel_system, result_type)
     log_end(mechanism.name, result)
     return result
+
+
+def run_whole(mechanism: Mechanism, options: RunOptions, result_type: type[Result]) -> Result:
+    """A run without event actions; the parameters are those of :func:`run_segment`."""
+    with SuccessiveWorkspaces() as workspaces:
+        return run_segment(mechanism, options, result_type, workspaces)
 
 
 def lead_with_cause(problem: Problem, record: RunRecord) -> None:
@@ -328,16 +333,10 @@ def mechanism_method(method: str | Method, tableau: str | ButcherTableau | None)
     return checked
 
 
-def _units_of_states(mechanism: Mechanism) -> FloatArray:
-    """The unit of each tangent component (2 nv,)."""
-    units = mechanism.structure.units
-    return np.concatenate([units.coordinate, units.coordinate * units.rate])
-
-
 def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArray:
     """Absolute tolerance per tangent component (2 nv,)."""
     if atol is None:
-        tolerance: FloatArray = rtol * _units_of_states(mechanism)
+        tolerance: FloatArray = rtol * mechanism.structure.units.state
         return tolerance
     nv = mechanism.model.nv
     remedy = f"Give one positive number, {nv} (per coordinate) or {2 * nv} (positions, then rates)"
@@ -360,7 +359,7 @@ def error_norm(mechanism: Mechanism, options: RunOptions) -> ErrorNorm:
     if options.atol is None and key in known:
         return known[key]
     atol = absolute_tolerance(mechanism, options.atol, options.rtol)
-    norm = ErrorNorm(atol, options.rtol, options.negligible, _units_of_states(mechanism))
+    norm = ErrorNorm(atol, options.rtol, options.negligible, mechanism.structure.units.state)
     if options.atol is None:
         if len(known) >= KEPT_NORMS:
             known.clear()
@@ -388,15 +387,9 @@ def _accepted_times(mechanism: Mechanism) -> set[float]:
     return set()
 
 
-def check_consistent(
-    mechanism: Mechanism, t: float = 0.0, observables: CompiledObservables | None = None
-) -> None:
-    """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates.
-
-    Parameters
-    ----------
-    observables
-        Evaluates them; None: the reference does.
+def check_consistent(mechanism: Mechanism, t: float = 0.0, backend: str = "python") -> None:
+    """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates, which
+    ``backend`` evaluates.
 
     Raises
     ------
@@ -405,26 +398,26 @@ def check_consistent(
     """
     accepted = _accepted_times(mechanism)
     if t not in accepted:
-        _check_errors(mechanism, t, observables)
+        _check_errors(mechanism, t, backend)
         accepted.add(t)
 
 
-def _check_errors(mechanism: Mechanism, t: float, observables: CompiledObservables | None) -> None:
+def _check_errors(mechanism: Mechanism, t: float, backend: str) -> None:
     q0, v0 = mechanism.q0, mechanism.v0
-    if observables is not None:
-        g, c = (e[0] for e in observables.closure_errors(np.array([t]), q0[None], v0[None]))
-    elif t == 0.0:
+    by_kernel = backend in COMPILED and not mechanism.drives
+    if t == 0.0 and not by_kernel:
         g, c = mechanism.initial_errors
     else:
-        g, c = (e[0] for e in constraint_errors(mechanism, np.array([t]), q0[None], v0[None]))
+        find = closure_errors if by_kernel else constraint_errors
+        g, c = (e[0] for e in find(mechanism, np.array([t]), q0[None], v0[None]))
     if not len(g):
         return
     units = mechanism.structure.units
     unit = constraint_units(mechanism, units)
-    speed = max(units.rate, float(np.abs(v0 / units.coordinate).max()))
+    speed = max(units.rate, *np.abs(v0 / units.coordinate).tolist())
     for what, values, limit in (("q0", g, CONSISTENT), ("v0", c, CONSISTENT * speed)):
         errors = np.abs(values) / unit
-        if np.logical_or.reduce(errors > limit):
+        if max(errors.tolist()) > limit:
             worst = int(errors.argmax())
             kind = "drives" if worst >= len(g) - len(mechanism.drives) else "closures"
             raise InputError(
@@ -462,7 +455,6 @@ def assemble_problem(
     mechanism, state = initial_state(mechanism, t0, options.q0, options.v0)
     norm = error_norm(mechanism, options)
     held = None if options.sample_time is None else HeldForce()
-    kernel_system = None
     last_step = 0.0
     if before is not None and held is None and before.mechanism.structure is mechanism.structure:
         start, end = before.span
@@ -470,14 +462,11 @@ def assemble_problem(
         last_step = min(last_step, longest) if longest > SHORTEST_REPEATED * last_step else 0.0
         system = before.system
         system.restart()
-        kernel_system = before.kernel_system
     else:
         system = make_system(mechanism, options.controller if held is None else held)
     mechanism.check_covers(t_end)
     if mechanism.constrained:
-        # Rows with drives begin with the state: the kernel would have to make them anew.
-        by_kernel = by in COMPILED and not mechanism.drives
-        check_consistent(mechanism, t0, CompiledObservables(system) if by_kernel else None)
+        check_consistent(mechanism, t0, by)
     watch = None
     if options.events is not None:
         nq = mechanism.model.nq
@@ -493,7 +482,7 @@ def assemble_problem(
     problem.code = code
     if by == "kernel" and options.backend == "auto" and code_is_compiled():
         problem.meter = Meter(mechanism)
-    problem.kernel_system, problem.last_step = kernel_system, last_step
+    problem.last_step = last_step
     problem.stiff = before is not None and before.steps.ends_stiff
     # Sweeps say at the end what they met in their steps.
     if options.t_eval is not None and isinstance(method, PSRM) and method.correction == "split":
@@ -559,28 +548,25 @@ def placed_control(
 # --- integrate ------------------------------------------------------------------------------------
 
 
-def integrate_problem(problem: Problem) -> tuple[RunRecord, Counters, Any]:
-    """The record of the run, its counters, and the kernel's system if there is one.
+def integrate_problem(
+    problem: Problem, workspaces: SuccessiveWorkspaces
+) -> tuple[RunRecord, Counters, Any]:
+    """The record of the run, its counters, and the kernel's system if there is one, which is of
+    ``workspaces``.
 
     Whatever happens on the way ends in the record: a start that cannot be evaluated, too.
     """
-    kernel_system: Any = problem.kernel_system
-    if kernel_system is not None:
-        kernel_system.renew(**problem.system.constants_of_start())
-    made_here = problem.backend in COMPILED and kernel_system is None
+    kernel_system = None
     try:
-        with (
-            workspace(problem.system, problem.code)
-            if made_here
-            else nullcontext(kernel_system) as kernel_system
-        ):
+        if problem.backend in COMPILED:
+            kernel_system = workspaces.of(problem.system, problem.code)
+        found = _integrate(problem, kernel_system)
+        if _starts_too_fast(found[0], problem.options):
+            # The transient is too short for any step: implicit ones pass over it.
+            problem.stiff = True
+            problem.last_step = STIFF_START * (problem.options.t_end - problem.options.t0)
             found = _integrate(problem, kernel_system)
-            if _starts_too_fast(found[0], problem.options):
-                # The transient is too short for any step: implicit ones pass over it.
-                problem.stiff = True
-                problem.last_step = STIFF_START * (problem.options.t_end - problem.options.t0)
-                found = _integrate(problem, kernel_system)
-            return *found, kernel_system
+        return *found, kernel_system
     except (EvaluationError, ControllerError) as error:
         return failed_start(problem.options.t0, problem.state, error, " s"), (), kernel_system
 
@@ -826,7 +812,7 @@ class FinishedRun:
                 self.steps, self.output = None, kept
                 if not self._controlled:
                     repeated = self._options._replace(t_eval=None, backend=self.backend)
-                    self.again = partial(run_segment, self._mechanism, repeated, result_type)
+                    self.again = partial(run_whole, self._mechanism, repeated, result_type)
             else:
                 self.steps = kept
         if self._controlled or not isinstance(record, CompiledRecord):
@@ -844,10 +830,9 @@ class FinishedRun:
     @cached_property
     def nodes(self) -> tuple[FloatArray, FloatArray]:
         record = self._record
-        if isinstance(record, CompiledRecord) and record.stop is None:
-            found = record.nodes()
-            if found is not None:
-                return found
+        found = record.nodes() if isinstance(record, CompiledRecord) else None
+        if found is not None:
+            return found
         return cast(DenseOutput, self.dense).nodes()
 
     @cached_property
@@ -966,7 +951,7 @@ def bifurcation_sentences(found: Sequence[Bifurcation]) -> str:
     return "".join(f" {bifurcation}." for bifurcation in found[:DESCRIBED_BIFURCATIONS]) + more
 
 
-@per_model
+@per_tree
 def _limited_joints(mechanism: Mechanism) -> list[tuple[str, int, float, float]]:
     """Name, index in q, least and largest coordinate of the one-degree joints with limits."""
     model = mechanism.model

@@ -9,6 +9,7 @@ from operator import attrgetter
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.controllers import HeldForce
@@ -18,7 +19,7 @@ from srm_mbs.integration.dense_output import StepData, check_within, checked_out
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.singular_passages import Bifurcation, Crossing
 from srm_mbs.simulation.energy_balance import EnergyBalance, joined_balance
-from srm_mbs.simulation.result import SimulationResult, Statistics
+from srm_mbs.simulation.result import Settings, SimulationResult, Statistics
 
 _STATISTICS = attrgetter(*(key.name for key in fields(Statistics)))
 
@@ -49,27 +50,12 @@ class SegmentedResult(SimulationResult):
         first = self.segments[0]
         self.mechanism = first.mechanism
         self.scheme = first.scheme
-        stiff = tuple(
-            times
-            for part in self.segments
-            if np.logical_or.reduce(part.steps.stiff)
-            for times in part.settings.stiff
-        )
-        self.settings = replace(first.settings, stiff=stiff)
         self.status, self.message = RunStatus(status), message
-        attempts = [segment.attempts for segment in self.segments]
-        self.attempts = np.concatenate([some for some in attempts if len(some)] or attempts[:1])
-        self._starts = np.array([segment.steps.times[0] for segment in self.segments])
-        counts = zip(*(_STATISTICS(part.stats) for part in self.segments))
-        self.stats = Statistics(*map(sum, counts))
         self.t_eval = t_eval
         self._parts: tuple[SimulationResult, ...] = self.segments
         self._order: IndexArray | slice = slice(None)
         if t_eval is not None:
             self._read_at(t_eval[t_eval <= self.segments[-1].steps.end])
-        self.t = self.rows_of_parts(lambda part: part.t)
-        self.q = self.rows_of_parts(lambda part: part.q)
-        self.v = self.rows_of_parts(lambda part: part.v)
         self.t_events = self.q_events = self.v_events = None
         if first.t_events is not None:
             count = range(len(first.t_events))
@@ -82,6 +68,36 @@ class SegmentedResult(SimulationResult):
     def segments(self) -> tuple[SimulationResult, ...]:
         """The smooth parts of the run, between the actions of events."""
         return self._segments
+
+    @cached_property
+    def settings(self) -> Settings:  # type: ignore[override]
+        stiff = tuple(
+            times
+            for part in self.segments
+            if np.logical_or.reduce(part.steps.stiff)
+            for times in part.settings.stiff
+        )
+        return replace(self.segments[0].settings, stiff=stiff)
+
+    @cached_property
+    def attempts(self) -> NDArray[np.void]:  # type: ignore[override]
+        attempts = [segment.attempts for segment in self.segments]
+        return np.concatenate([some for some in attempts if len(some)] or attempts[:1])
+
+    @cached_property
+    def stats(self) -> Statistics:  # type: ignore[override]
+        counts = zip(*(_STATISTICS(part.stats) for part in self.segments))
+        return Statistics(*map(sum, counts))
+
+    @cached_property
+    def _nodes(self) -> tuple[FloatArray, FloatArray]:
+        t = self.rows_of_parts(lambda part: part._nodes[0])
+        return t, self.rows_of_parts(lambda part: part._nodes[1])
+
+    @cached_property
+    def _starts(self) -> FloatArray:
+        """Times (s) at which the segments start."""
+        return np.array([segment.steps.times[0] for segment in self.segments])
 
     def _read_at(self, t: FloatArray) -> None:
         """Read each segment at those of ``t`` that lie in it; at a jump the later segment."""

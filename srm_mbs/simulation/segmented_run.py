@@ -5,18 +5,17 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import EvaluationError, EventError, InputError, get_logger, safe_repr
@@ -30,14 +29,10 @@ from srm_mbs.integration.events import (
     same_time,
     stop_message,
 )
-from srm_mbs.integration.generated.code import code_of_record
-from srm_mbs.integration.kernel.backend import COMPILED
-from srm_mbs.integration.kernel.system import Evaluator
-from srm_mbs.integration.kernel.system import workspace as workspace_of
+from srm_mbs.integration.kernel.system import Evaluator, SuccessiveWorkspaces
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
-from srm_mbs.model.numbers import finite_array
-from srm_mbs.simulation.options import RunOptions, numbers, positive
+from srm_mbs.simulation.options import RunOptions, positive
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.runner import (
     check_consistent,
@@ -46,6 +41,7 @@ from srm_mbs.simulation.runner import (
     initial_state,
     raise_at_first_call,
     run_segment,
+    run_whole,
     unstarted_segment,
 )
 from srm_mbs.simulation.segmented_result import R, ResultTypes
@@ -102,10 +98,10 @@ class _OfState:
 
     def __init__(self, event: Callable[..., Any], nq: int) -> None:
         self._function = event.function if isinstance(event, Event) else event
-        self._nq = nq
+        self._q, self._v = slice(None, nq), slice(nq, None)
 
     def __call__(self, t: float, state: FloatArray) -> Any:
-        return self._function(t, state[: self._nq], state[self._nq :])
+        return self._function(t, state[self._q], state[self._v])
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,67 +126,6 @@ class Switch:
     mechanism: Mechanism
     q: Any = None
     v: Any = None
-
-
-def impact(
-    mechanism: Mechanism, q: Any, v: Any, normal: Any, restitution: float = 0.0
-) -> FloatArray:
-    """Velocities after an impact that closures take part in.
-
-    An impulse acts along ``normal`` and along the closures, so that the rate n.v turns into
-    -e n.v while G v = 0 stays: v + a mu with a = (1 - P) M^{-1} n (Newton's law of restitution).
-
-    Parameters
-    ----------
-    mechanism
-        What is hit.
-    q : (nq,), v : (nv,)
-        State before.
-    normal : (nv,)
-        n: gradient of the distance to the stop in the coordinates of v.
-    restitution
-        e, from 0 (it stays) to 1 (elastic).
-
-    Returns
-    -------
-    v : (nv,)
-
-    Raises
-    ------
-    InputError
-        For another shape, a restitution that is none, or if the closures do not let the mechanism
-        move along ``normal``.
-    """
-    import pinocchio as pin
-
-    check_mechanism(mechanism)
-    share = finite_array(restitution, ())
-    if share is None or not 0.0 <= share <= 1.0:
-        raise InputError(
-            f"restitution = {safe_repr(restitution)} is not between 0 and 1",
-            element="restitution",
-            remedy="Give 0 (nothing springs back) to 1 (all of it)",
-        )
-    here = mechanism.continued(q, v)
-    remedy = f"Give {here.model.nv} numbers"
-    n = numbers(normal, "normal", remedy)
-    if n.shape != here.v0.shape:
-        raise InputError(
-            f"normal has shape {n.shape}, not {here.v0.shape}", element="normal", remedy=remedy
-        )
-    M = pin.crba(here.model, workspace(here.model), here.q0, pin.Convention.WORLD)
-    along = np.linalg.solve(np.triu(M) + np.triu(M, 1).T, n)
-    terms = make_system(here).evaluate(0.0, np.concatenate([here.q0, here.v0]))
-    free = along - terms.project(along)
-    gain = float(n @ free)
-    if not gain > 1e-12 * float(n @ along):
-        raise InputError(
-            "the closures do not let the mechanism move along this normal",
-            element="normal",
-            remedy="Give the gradient of the gap, which some motion of the mechanism changes",
-        )
-    out: FloatArray = here.v0 - (1.0 + restitution) * float(n @ here.v0) / gain * free
-    return out
 
 
 log = get_logger(__name__)
@@ -296,10 +231,10 @@ class _RunEvent:
         self.contact, self.acted, self.zero = None, acted, zero
         self.counts_from = -1
 
-    def acts_at_once(self, probe: ContactProbe, t: float, state: FloatArray, slack: float) -> bool:
-        """Whether it touches at ``t`` (s) and ``state``, and leaves to the forbidden side."""
+    def acts_at_once(self, probe: ContactProbe, slack: float) -> bool:
+        """Whether it touches where ``probe`` is, and leaves to the forbidden side."""
         self.rounding = partial(probe.rounding, self.event)
-        self.contact = contact = probe.contact(self.event, t, state, self.zero, slack, self.floor)
+        self.contact = contact = probe.contact(self.event, self.zero, slack, self.floor)
         if contact is None or contact.rate < self.counts_from:
             return False
         self.counts_from = -1
@@ -369,14 +304,20 @@ def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
         options = options._replace(events=list(options.events))
     checked = checked_options(mechanism, options)
     if acting(options.events):
-        result = _run_segments(mechanism, checked, types)
+        with SuccessiveWorkspaces() as workspaces:
+            result = _run_segments(mechanism, checked, types, workspaces)
     else:
-        result = run_segment(mechanism, checked, types.plain)
+        result = run_whole(mechanism, checked, types.plain)
     result.request = options.repeatable()
     return finished(result, checked)
 
 
-def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
+def _run_segments(
+    mechanism: Mechanism,
+    options: RunOptions,
+    types: ResultTypes[R],
+    workspaces: SuccessiveWorkspaces,
+) -> R:
     """The segments between the actions of events, joined."""
     t_end, nq = options.t_end, mechanism.model.nq
     given = prepare_events(options.events, lambda event: _OfState(event, nq))
@@ -408,7 +349,8 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
     while status is RunStatus.RUNNING:
         try:
             asked = here._replace(events=[event.in_segment() for event in events])
-            part = run_segment(mechanism, asked, types.plain, parts[-1] if parts else None)
+            before = parts[-1] if parts else None
+            part = run_segment(mechanism, asked, types.plain, workspaces, before)
             part.request = asked.repeatable()
             parts.append(part)
             status, t = part.status, part.steps.end
@@ -419,7 +361,10 @@ def _run_segments(mechanism: Mechanism, options: RunOptions, types: ResultTypes[
                     due.append(event)
             if status is not RunStatus.EVENT or any(event.left <= 0 for event in due):
                 break
-            mechanism, q, v = _after_actions(events, due, part, here.controller, span, at_once)
+            known = workspaces.evaluator(part.system)
+            mechanism, q, v = _after_actions(
+                events, due, part, known, here.controller, span, at_once
+            )
             last = next((event for event in events if event.left <= 0), None)
             if last is not None:
                 message = stop_message(last.event.name, last.count, t)
@@ -497,6 +442,7 @@ def _act_at_once(
     occurred: list[Occurrence],
     slack: Callable[[_RunEvent], float] = lambda event: 0.0,
     system: Any = None,
+    backend: str = "python",
 ) -> tuple[Mechanism, FloatArray, FloatArray]:
     """Mechanism and state after the actions of ``contacts`` that touch at ``t`` and leave to their
     forbidden side, one after the other until none does (:mod:`srm_mbs.integration.contacts`).
@@ -509,6 +455,8 @@ def _act_at_once(
         Size of the value of an event on its forbidden side that is zero.
     system
         The equations of motion, if they are known.
+    backend
+        Evaluates the closures.
 
     Raises
     ------
@@ -520,8 +468,8 @@ def _act_at_once(
         x = np.concatenate([q, v])
         if system is None:
             system = make_system(mechanism, controller)
-        probe = ContactProbe(system, units, span)
-        leaving = [event for event in contacts if event.acts_at_once(probe, t, x, slack(event))]
+        probe = ContactProbe(system, units, span, t, x)
+        leaving = [event for event in contacts if event.acts_at_once(probe, slack(event))]
         if not leaving:
             return mechanism, q, v
         event = leaving[0]
@@ -531,7 +479,7 @@ def _act_at_once(
         if event.left <= 0:
             return mechanism, q, v
         structure = mechanism.structure
-        mechanism, q, v = _acted(event, mechanism, t, q, v)
+        mechanism, q, v = _acted(event, mechanism, t, q, v, backend)
         if mechanism.structure is not structure:
             system = None
         event.check_chatter(t, span)
@@ -543,7 +491,7 @@ def _rounding(event: _RunEvent, solution: SimulationResult) -> float:
     return HELD_EVENT_ROUNDING * max(abs(event.value(t, x)) for t, x in zip(solution.t, states))
 
 
-def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
+def _closed(system: OpenSystem | ClosedSystem | Evaluator, t: float, x: FloatArray) -> bool:
     """Whether ``x`` is on the closures to rounding.
 
     A projection would then gain nothing, and next to a singular configuration it would move ``x``
@@ -552,14 +500,16 @@ def _closed(system: OpenSystem | ClosedSystem, t: float, x: FloatArray) -> bool:
     if not system.has_constraints:
         return True
     g, c = system.residuals(x, t)
-    speed = 1.0 + float(np.abs(x[system.nq :]).max())
-    return bool((np.abs(g) < CLOSED_ROUNDING).all() and (np.abs(c) < CLOSED_ROUNDING * speed).all())
+    # Of lists: they are short, and NumPy takes five times as long.
+    error, rate, speed = (max(map(abs, part.tolist())) for part in (g, c, x[system.nq :]))
+    return bool(error < CLOSED_ROUNDING and rate < CLOSED_ROUNDING * (1.0 + speed))
 
 
 def _after_actions(
     events: list[_RunEvent],
     due: list[_RunEvent],
     part: SimulationResult,
+    known: OpenSystem | ClosedSystem | Evaluator,
     controller: Callable[..., Any] | None,
     span: float,
     at_once: list[Occurrence],
@@ -576,12 +526,11 @@ def _after_actions(
     # What was counted here is not counted again just after; the rest has still to be.
     near = 2.0 * same_time(*part.steps.times[-2:].tolist())
     nq = mechanism.model.nq
-    before = x = np.concatenate([part.q[-1], part.v[-1]])
-    system = part.system if controller is None else make_system(mechanism)
+    before = x = part.last_state
     try:
         # The dense output is on the closures within the tolerance only.
-        if not _closed(system, t, x):
-            x = onto_closures(system, t, x)
+        if not _closed(known, t, x):
+            x = onto_closures(part.system if controller is None else make_system(mechanism), t, x)
     except EvaluationError as error:
         raise EventError(f"no action could be taken: {error}") from error
     for event, times in zip(events, part.t_events or []):
@@ -589,11 +538,12 @@ def _after_actions(
         acted = event in due and event.event.action is not None
         event.begin_instant(acted, 2.0 * abs(event.value(t, x)) if acted else 0.0)
     acting_events = [event for event in events if event.acted]
-    names = ", ".join(event.name for event in acting_events)
-    log.debug("%s: action of %s at t = %.9g s", mechanism.name, names, t)
+    if log.isEnabledFor(logging.DEBUG):
+        names = ", ".join(event.name for event in acting_events)
+        log.debug("%s: action of %s at t = %.9g s", mechanism.name, names, t)
     q, v = x[:nq], x[nq:]
     for event in acting_events:
-        mechanism, q, v = _acted(event, mechanism, t, q, v)
+        mechanism, q, v = _acted(event, mechanism, t, q, v, part.backend)
     switched = mechanism.loops != part.mechanism.loops
     for event in acting_events:
         event.floor = _rounding(event, part) if switched else 0.0
@@ -604,34 +554,18 @@ def _after_actions(
         return 0.0 if x is before else 2.0 * abs(event.value(t, x) - event.value(t, before))
 
     contacts = [event for event in events if event.may_touch]
-    if contacts:
-        with _equations(part) as known:
-            if mechanism.structure is not part.mechanism.structure:
-                known = None
-            return _act_at_once(
-                contacts, mechanism, t, q, v, controller, span, at_once, moved_by, known
-            )
-    return mechanism, q, v
-
-
-@contextmanager
-def _equations(part: SimulationResult) -> Iterator[Any]:
-    """The equations of motion of ``part``, whose closures its kernel evaluates, if it can."""
-    system = part.system
-    if not system.has_constraints or part.backend not in COMPILED:
-        yield system
-    elif part.kernel_system is not None:
-        yield Evaluator(system, part.kernel_system)
-    else:
-        code = code_of_record(part.backend, system.mechanism)
-        with workspace_of(system, code) as kernel_system:
-            yield Evaluator(system, kernel_system)
+    if not contacts:
+        return mechanism, q, v
+    system = known if mechanism.structure is part.mechanism.structure else None
+    return _act_at_once(
+        contacts, mechanism, t, q, v, controller, span, at_once, moved_by, system, part.backend
+    )
 
 
 def _acted(
-    event: _RunEvent, mechanism: Mechanism, t: float, q: FloatArray, v: FloatArray
+    event: _RunEvent, mechanism: Mechanism, t: float, q: FloatArray, v: FloatArray, backend: str
 ) -> tuple[Mechanism, FloatArray, FloatArray]:
-    """Mechanism and state after the action of ``event``.
+    """Mechanism and state after the action of ``event``; ``backend`` evaluates the closures.
 
     Raises
     ------
@@ -648,7 +582,7 @@ def _acted(
         q, v = (np.asarray(part, dtype=float) for part in answer)
         moved = mechanism.continued(q, v)
         if moved.constrained:
-            check_consistent(moved, t)
+            check_consistent(moved, t, backend)
         return moved, moved.q0, moved.v0
     except (InputError, EvaluationError, TypeError, ValueError) as error:
         raise EventError(

@@ -14,6 +14,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
+from srm_mbs.assembly import position
 from srm_mbs.assembly.assemble import Assembly
 from tests.support.bundled import load, rewritten
 from tests.support.mechanisms import DISTINCT_MODELS, along_x, floating_ring, rescaled, rod
@@ -788,3 +789,14 @@ def test_loops_that_share_no_joint_close_by_themselves() -> None:
     gaps = {name: gap for name, (gap, _) in caught.value.residuals.items()}
     assert gaps.pop("B7") == pytest.approx(9.0 - np.hypot(1.2, 0.0) - 0.4 - np.hypot(0.2, 0.8))
     assert max(gap for gap in gaps.values() if gap is not None) < 1e-12
+
+
+@pytest.mark.parametrize("name", ["four_bar", "four_bar_planar", "five_bar", "squeezing_mechanism"])
+def test_a_start_that_closures_determine_is_that_of_the_trust_region_solve(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    contracted = srm.load(name)
+    monkeypatch.setattr(position, "FIRST_STEP", 0.0)
+    searched = srm.load(name)
+    assert np.abs(contracted.q0 - searched.q0).max() < 1e-14
+    assert np.abs(contracted.v0 - searched.v0).max() < 1e-12

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.formats import build
 from srm_mbs.formats.load import models_folder
 from tests.support.snapshots import check_refusals
 
@@ -68,6 +70,37 @@ def test_a_changed_file_has_the_scaled_places_and_inertias(file: Path, longer: f
     before, after = (each.model.inertias[joint["coupler"]] for each in (plain, found))
     assert after.mass == before.mass + 0.5
     np.testing.assert_allclose(after.inertia, before.inertia + np.diag([0, 0.125, 0.125]))
+
+
+def test_a_variant_is_the_mechanism_of_a_load_bit_by_bit_without_reading_the_file(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = srm.load(file)
+    fresh = srm.load(file, parameters={"longer": 1.2})
+    with monkeypatch.context() as patched:
+        patched.setattr(build, "build_urdf", None)
+        variant = pickle.loads(pickle.dumps(base)).with_parameters(longer=1.2)
+    assert variant.model == fresh.model
+    for one, other in zip(variant.model.inertias, fresh.model.inertias):
+        assert np.array_equal(one.toDynamicParameters(), other.toDynamicParameters())
+    for name in ("loops", "points", "notes", "source", "parameters"):
+        assert getattr(variant, name) == getattr(fresh, name), name
+    for name in ("q0", "v0"):
+        assert np.array_equal(getattr(variant, name), getattr(fresh, name))
+
+
+@pytest.mark.parametrize("longer", [0.0, -1.0, 1e200])
+def test_a_variant_with_a_fault_is_refused_as_a_load_is(file: Path, longer: float) -> None:
+    base = srm.load(file)
+    refusals = []
+    for make in (
+        lambda: base.with_parameters(longer=longer),
+        lambda: srm.load(file, parameters={"longer": longer}),
+    ):
+        with pytest.raises(srm.SrmError) as refused:
+            make()
+        refusals.append(str(refused.value))
+    assert refusals[0] == refusals[1]
 
 
 def test_a_variant_and_a_conversion_have_the_changed_numbers(file: Path, tmp_path: Path) -> None:

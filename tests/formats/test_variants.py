@@ -15,6 +15,7 @@ from srm_mbs.dynamics.constraints.reusable_analysis import ReusableAnalysis
 from srm_mbs.dynamics.constraints.rheonomic import unscaled_rows
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.dynamics.scaling import anchor_points
+from srm_mbs.formats.planar.drawing import Drawing
 
 FOUR_BAR = """format = 1
 name = "bars"
@@ -150,7 +151,10 @@ def test_a_variant_is_the_mechanism_of_a_load_bit_by_bit(
     """With places, masses and forces that vary, and another line of a slide."""
     path = tmp_path / "press.toml"
     path.write_text(PRESS, encoding="utf-8")
-    variant, fresh = srm.load(path).with_parameters(**values), srm.load(path, parameters=values)
+    _check_same(srm.load(path).with_parameters(**values), srm.load(path, parameters=values))
+
+
+def _check_same(variant: srm.Mechanism, fresh: srm.Mechanism) -> None:
     assert variant.model == fresh.model
     for one, other in zip(variant.model.inertias, fresh.model.inertias):
         assert np.array_equal(one.toDynamicParameters(), other.toDynamicParameters())
@@ -158,6 +162,108 @@ def test_a_variant_is_the_mechanism_of_a_load_bit_by_bit(
         assert getattr(variant, name) == getattr(fresh, name), name
     for name in ("q0", "v0"):
         assert np.array_equal(getattr(variant, name), getattr(fresh, name))
+
+
+LIFT = """format = 1
+[parameters]
+reach = 0.3
+long = 0.8
+wide = 0.31
+flywheel = 0.02
+offset = 0.01
+block = 0.5
+spin = 0.04
+density = 2.0
+speed = 1.5
+ends = 0.0
+[planar]
+ground = ["O", "C", "S"]
+mass_per_length = "=density"
+rates = { O = "=speed" }
+[planar.points]
+O = [0, 0]
+A = ["=0.6*reach", "=0.8*reach"]
+B = [0.8, 0.5]
+C = [0.9, 0]
+P = [0.5, "=0.6 + ends"]
+Q = [1.0, 0.7]
+S = [0.2, 1.4]
+[[planar.bar]]
+name = "crank"
+points = ["O", "A"]
+inertia = "=flywheel"
+centre = ["=offset", 0]
+mass = 1.0
+[[planar.bar]]
+name = "plate"
+points = ["A", "B", "P"]
+[[planar.bar]]
+name = "rocker"
+points = ["B", "C"]
+length = "=0.7*long"
+[[planar.bar]]
+name = "link"
+points = ["P", "Q"]
+[[planar.slider]]
+name = "block"
+point = "Q"
+along = 0.3
+mass = "=block"
+inertia = "=spin"
+[[planar.length]]
+between = ["B", "P"]
+length = "=wide"
+[[planar.spring]]
+a = "S"
+b = "P"
+stiffness = 30.0
+rest_length = 0.2
+[[planar.load]]
+point = "P"
+force = [0, -1]
+"""
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"reach": 0.29},
+        {"long": 0.82, "offset": 0.02},
+        {"wide": 0.32, "flywheel": 0.03},
+        {"block": 0.6, "spin": 0.05},
+        {"density": 2.5},
+        {"speed": 2.0},
+        {"ends": 0.01},
+        {"block": 0.0},
+    ],
+)
+def test_a_variant_with_plates_lengths_and_loads_is_the_mechanism_of_a_load(
+    values: dict[str, float], tmp_path: Path
+) -> None:
+    path = tmp_path / "lift.toml"
+    path.write_text(LIFT, encoding="utf-8")
+    base = srm.load(path)
+    _check_same(base.with_parameters(**values), srm.load(path, parameters=values))
+
+
+def test_only_the_numbers_of_a_variant_are_read(
+    bars: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The drawing is not translated again, until a text is asked for."""
+    base = pickle.loads(pickle.dumps(srm.load(bars)))
+    drawn = []
+    draw = Drawing.__init__
+
+    def counted(self: Drawing, *given: Any) -> None:
+        drawn.append(given)
+        draw(self, *given)
+
+    monkeypatch.setattr(Drawing, "__init__", counted)
+    variant = base.with_parameters(crank=0.45, mass=2.0)
+    assert not drawn
+    assert variant.source is not None
+    assert "<visual>" in variant.source.urdf
+    assert len(drawn) == 1
 
 
 def test_rows_of_a_variant_are_those_of_its_own_closures(bars: Path) -> None:

@@ -42,7 +42,9 @@ around 1e-9, on either backend), and a chaotic motion."""
 
 
 SLOPES = {"parallelogram": 0.75}
-"""Least slopes of mechanisms whose first errors lie far below the tolerance: 0.78 was measured."""
+"""Least slopes where placement, not the tolerance, sets the lengths of the first steps: dop853
+takes 169 of them at 1e-5 (80 without placement), with error estimates of 1e-3 of the tolerance.
+Its slope is 0.78 from 1e-5 on and 1.0 from 1e-7 on."""
 
 
 def errors(name: str, tableau: str, tolerances: list[float]) -> np.ndarray:

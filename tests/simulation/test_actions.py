@@ -305,6 +305,26 @@ def test_an_impact_in_a_loop_keeps_the_loop_and_loses_the_energy_it_should() -> 
     )
 
 
+def test_an_action_may_run_the_mechanism_that_it_acts_on() -> None:
+    """The kernel system of the run around it is lent to nobody meanwhile."""
+    mechanism = load("four_bar")
+
+    def stop(acted: bool) -> srm.Event:
+        def hit(t: float, q: Any, v: Any) -> Any:
+            if acted:
+                srm.simulate(mechanism, 0.2)
+                srm.simulate(mechanism, 0.2, q0=q, v0=v).at([0.1])
+            return q, srm.impact(mechanism, q, v, [1.0, 0.0, 0.0], 0.8)
+
+        start = mechanism.q0[0]
+        return srm.Event(lambda t, q, v: start + 0.1 - q[0], direction=-1, action=hit)
+
+    alone, beside = (srm.simulate(mechanism, 2.0, events=stop(acted)) for acted in (False, True))
+    assert len(alone.segments) > 1
+    np.testing.assert_array_equal(alone.t, beside.t)
+    np.testing.assert_array_equal(alone.v, beside.v)
+
+
 def test_an_impact_of_two_masses_conserves_momentum() -> None:
     """Newton's law between free bodies, elastic: equal masses exchange their velocities."""
     model = one_joint(pin.JointModelPX(), "a")

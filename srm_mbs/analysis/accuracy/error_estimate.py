@@ -389,9 +389,7 @@ class Readings:
         units = solution.mechanism.structure.units
         self._allowed = None
         if allowed is not None:
-            self._allowed = allowed * np.concatenate(
-                [units.coordinate, units.coordinate * units.rate]
-            )
+            self._allowed = allowed * units.state
         self._known: dict[tuple[int, bytes], SimulationResult] = {}
 
     def __call__(self, run: SimulationResult, times: FloatArray) -> SimulationResult:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ from srm_mbs.dynamics.constraints.rows import COINCIDENT, LoopKinematics
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 _NO_NUMBERS = np.zeros(0)
+KEPT_SUPPORTS = 256
+"""Closures whose coordinates are kept: variants of a mechanism have the same."""
 
 
 def closure_structs(constants: dict[str, Any]) -> dict[str, Any]:
@@ -42,8 +44,17 @@ def closure_structs(constants: dict[str, Any]) -> dict[str, Any]:
 
 def _closure_rows(support: FloatArray, **rows: Any) -> Any:
     made: Any = core
-    columns = np.flatnonzero(support)
-    return made.ClosureRows(columns=columns.tolist(), signs=support[columns].astype(float), **rows)
+    columns, signs = _columns_and_signs(support.tobytes())
+    return made.ClosureRows(columns=columns, signs=signs, **rows)
+
+
+@lru_cache(maxsize=KEPT_SUPPORTS)
+def _columns_and_signs(support: bytes) -> tuple[list[int], FloatArray]:
+    """The coordinates that move a closure, and in which sense, from the bytes of its support (nv,);
+    nothing may change them."""
+    signs = np.frombuffer(support)
+    columns = np.flatnonzero(signs)
+    return columns.tolist(), signs[columns]
 
 
 class ClosureRows:
@@ -52,7 +63,8 @@ class ClosureRows:
     Parameters
     ----------
     model, rows
-        The tree, and the rows of its closures, without motions of drives.
+        The tree, and the rows of its closures, without motions of drives; only a copy of their
+        workspace is evaluated.
 
     Attributes
     ----------
@@ -61,7 +73,7 @@ class ClosureRows:
     """
 
     def __init__(self, model: pin.Model, rows: LoopKinematics) -> None:
-        self._model, self._rows = model, rows
+        self._model, self._given = model, rows
         self.g, self.G = rows.g, rows.G
         self._kernel: Any = None
         if core is None:
@@ -98,6 +110,10 @@ class ClosureRows:
     @cached_property
     def _data(self) -> pin.Data:
         return workspace(self._model)
+
+    @cached_property
+    def _rows(self) -> LoopKinematics:
+        return self._given.copy_workspace()
 
     def at(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """g and G at the configuration q (nq,).
@@ -182,7 +198,7 @@ class ClosureRows:
 
 @per_model
 def _shared_rows(mechanism: MechanismData) -> ClosureRows:
-    return ClosureRows(mechanism.model, unscaled_rows(mechanism).copy_workspace())
+    return ClosureRows(mechanism.model, unscaled_rows(mechanism))
 
 
 def compiled_rows(mechanism: MechanismData) -> ClosureRows:
@@ -190,7 +206,7 @@ def compiled_rows(mechanism: MechanismData) -> ClosureRows:
     none keeps results in it."""
     if core is not None:
         return _shared_rows(mechanism)
-    return ClosureRows(mechanism.model, unscaled_rows(mechanism).copy_workspace())
+    return ClosureRows(mechanism.model, unscaled_rows(mechanism))
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from srm_mbs.dynamics.scaling import (
     row_units,
 )
 from srm_mbs.model.drives import in_order_of_rows, positions
-from srm_mbs.model.mechanism import MechanismData, per_model, per_start
+from srm_mbs.model.mechanism import MechanismData, per_model, per_start, per_tree
 
 CLEARLY_MORE = 1e-12
 """Mean square of the norm of a row, in units, above which it is no rounding: that of one without
@@ -464,7 +464,7 @@ def column_groups(mechanism: MechanismData) -> tuple[list[list[int]], BoolArray]
     return groups, related
 
 
-@per_model
+@per_tree
 def turning_coordinates(mechanism: MechanismData) -> BoolArray:
     """:func:`~srm_mbs.dynamics.scaling.periodic_coordinates` of a mechanism."""
     return periodic_coordinates(mechanism.model)

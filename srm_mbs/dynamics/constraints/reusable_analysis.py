@@ -14,6 +14,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, unscaled_rows
+from srm_mbs.dynamics.constraints.rows import Places
 from srm_mbs.dynamics.constraints.structure import (
     CLOSED,
     CLOSING_STEPS,
@@ -30,6 +31,7 @@ from srm_mbs.dynamics.constraints.structure import (
     structure_of,
 )
 from srm_mbs.dynamics.scaling import anchor_points, coordinate_units
+from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.mechanism import MechanismData
 
 CHECKED_STEPS = 6
@@ -55,6 +57,8 @@ class ReusableAnalysis:
         Median of the last structural pivot.
     rows, in_use
         The rows of the closures, unscaled, and those that are kept, scaled.
+    loops
+        The closures.
     """
 
     structure: Structure
@@ -62,6 +66,7 @@ class ReusableAnalysis:
     last_pivot: float
     rows: DrivenKinematics
     in_use: DrivenKinematics
+    loops: tuple[LoopClosure, ...]
 
     @classmethod
     def of(cls, mechanism: MechanismData) -> ReusableAnalysis | None:
@@ -72,7 +77,7 @@ class ReusableAnalysis:
             return None
         last_pivot = median(walked.last_pivots(structure.rank).tolist())
         rows, in_use = unscaled_rows(mechanism), rows_in_use(mechanism)
-        return cls(structure, walked.largest, last_pivot, rows, in_use)
+        return cls(structure, walked.largest, last_pivot, rows, in_use, mechanism.loops)
 
     def lend_rows(self, mechanism: MechanismData) -> None:
         """Give ``mechanism``, a variant whose tree has the same bodies and joints, the unscaled
@@ -82,7 +87,9 @@ class ReusableAnalysis:
         loops = mechanism.loops
         if not all(loop.anchors for loop in loops):
             return  # couplings have no places
-        rows = self.rows.moved(loops, [loop.resolve(mechanism.model) for loop in loops])
+        known = self._places_of(self.rows)
+        places = [known.get(id(loop)) or loop.resolve(mechanism.model) for loop in loops]
+        rows = self.rows.moved(loops, places)
         if rows is not None:
             unscaled_rows.keep(mechanism, rows)
             anchor_points.keep(mechanism, rows.anchors())
@@ -92,9 +99,21 @@ class ReusableAnalysis:
         :meth:`lend_rows`."""
         unscaled = unscaled_rows.kept(mechanism)
         if unscaled is not None and not mechanism.drives:
-            rows = self.in_use.moved(mechanism.loops, unscaled.places())
+            known, loops = self._places_of(self.in_use), mechanism.loops
+            places = [known.get(id(loop), place) for loop, place in zip(loops, unscaled.places())]
+            rows = self.in_use.moved(loops, places)
             if rows is not None:
                 rows_in_use.keep(mechanism, rows)
+
+    def _places_of(self, rows: DrivenKinematics) -> dict[int, Places]:
+        """The places of the closures in ``rows``, by their identity: variants that have the same
+        closures have them there."""
+        places = rows.places()
+        return (
+            {id(loop): place for loop, place in zip(self.loops, places)}
+            if len(places) == len(self.loops)
+            else {}
+        )
 
     def for_variant(self, mechanism: MechanismData) -> Structure | None:
         """The analysis in the units of ``mechanism``, a variant; None where it is not valid.

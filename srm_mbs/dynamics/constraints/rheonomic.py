@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -25,14 +26,22 @@ from srm_mbs.model.drives import NOMINAL_LENGTH, Drive, in_order_of_rows
 from srm_mbs.model.laws import Curve
 from srm_mbs.model.mechanism import MechanismData, per_model
 
+KEPT_JOINTS = 256
+"""Driven joints whose closures are kept: analyses ask for them several times."""
+
 
 def driven_closures(drives: Sequence[Drive]) -> list[LoopClosure]:
     """The closures whose rows are g(q) of the ``drives``, in the order of their rows."""
     return [
-        drive.closure
-        or LoopClosure("coupling", joints=(str(drive.joint),), coefficients=(1.0,), name=drive.name)
+        drive.closure or _driven_joint(str(drive.joint), drive.name)
         for drive in in_order_of_rows(drives)
     ]
+
+
+@lru_cache(maxsize=KEPT_JOINTS)
+def _driven_joint(joint: str, name: str) -> LoopClosure:
+    """The closure whose row is the coordinate of ``joint``, called ``name``."""
+    return LoopClosure("coupling", joints=(joint,), coefficients=(1.0,), name=name)
 
 
 class _DriveRow(NamedTuple):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from copy import copy
 from functools import cached_property, lru_cache
 from itertools import combinations, pairwise
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -59,6 +60,24 @@ def _check_names(points: tuple[str, ...], parts: tuple[tuple[str, str], ...]) ->
         )
 
 
+class Change(NamedTuple):
+    """All that some numbers of a drawing change, whatever they are.
+
+    Attributes
+    ----------
+    points
+        Names of the points that may move.
+    bodies
+        The bars and sliders whose shape or frame may change.
+    masses
+        Those whose mass or inertia may change otherwise.
+    """
+
+    points: frozenset[str]
+    bodies: frozenset[str]
+    masses: frozenset[str]
+
+
 class Drawing:
     """The points of a linkage, and where the bodies that they lie on have them.
 
@@ -87,13 +106,13 @@ class Drawing:
     """
 
     def __init__(self, entry: PlanarEntry) -> None:
-        self.entry = entry
         self.unit = LENGTH_UNITS[entry.unit]
         self.angle = math.radians(1.0) if entry.angle == "deg" else 1.0
-        self._drawn = self.unit * np.array(list(entry.points.values()), dtype=float)
-        self.points: dict[str, FloatArray] = dict(zip(entry.points, self._drawn))
+        self._draw(entry)
         self.ground = tuple(entry.ground)
         self._check_names()
+        self._known_nearest: dict[frozenset[str], float] = {}
+        """Results of :meth:`_nearest`."""
         self.bars: dict[str, PlanarBar] = {bar.name: bar for bar in entry.bar}
         self.sliders: dict[str, PlanarSlider] = {each.name: each for each in entry.slider}
         self.bodies = (WORLD, *self.bars, *(s.name for s in entry.slider if s.mass))
@@ -107,6 +126,78 @@ class Drawing:
         self._check_use()
         self._check_lengths()
         self._shapes = {name: self._shape(bar) for name, bar in self.bars.items()}
+
+    def _draw(self, entry: PlanarEntry) -> None:
+        """Take the places of all points from ``entry``."""
+        self.entry = entry
+        drawn = self.unit * np.array(list(entry.points.values()), dtype=float)
+        self.points: dict[str, FloatArray] = dict(zip(entry.points, drawn))
+        self._places = {name: (x, y) for name, (x, y) in zip(self.points, drawn.tolist())}
+        """The points as plain numbers."""
+        self._angles: dict[str, float] = {}
+        """Results of :meth:`body_angle` for bars."""
+        self.size = float(np.linalg.norm(np.ptp(drawn, axis=0))) if len(drawn) else 0.0
+        """Diagonal (m) of the drawing."""
+
+    def varied(self, entry: PlanarEntry, change: Change) -> Self | None:
+        """The drawing with the numbers of ``entry``, in which nothing but what ``change`` allows
+        differs; None where a check may refuse it, or where bodies gain or lose their mass."""
+        out = copy(self)
+        out._draw(entry)
+        out.bars, out._shapes = dict(self.bars), dict(self._shapes)
+        out.sliders = {each.name: each for each in entry.slider}
+        changed = change.bodies | change.masses
+        for bar in entry.bar:
+            if bar.name in changed:
+                own = self.bars[bar.name].points
+                out.bars[bar.name] = (
+                    bar if bar.points == own else bar.model_copy(update={"points": own})
+                )
+        if not SIZES[0] <= out.size <= SIZES[1] or not out._is_plain(self, change):
+            return None
+        for name in self.bars:
+            if name in change.bodies:
+                out._shapes[name] = out._shape(out.bars[name])
+        return out
+
+    def _is_plain(self, other: Drawing, change: Change) -> bool:
+        """Whether no check refuses this drawing, another one of which was checked."""
+        if any(
+            bool(own.mass) != bool(other.sliders[name].mass) for name, own in self.sliders.items()
+        ):
+            return False
+        limit = COINCIDENT * self.size
+        if other._nearest(change.bodies) <= limit:
+            return False
+        for name in self.bars:
+            if name in change.bodies:
+                pairs = combinations(self.bars[name].points, 2)
+                if min(self._apart(a, b) for a, b in pairs) <= limit:
+                    return False
+        try:
+            for bar in self.bars.values():
+                if bar.length is not None:
+                    self._check_bar(bar)
+            self._check_lengths()
+            for slider in self.sliders.values():
+                self.direction(slider)
+        except InputError:
+            return False
+        return True
+
+    def _nearest(self, others: frozenset[str]) -> float:
+        """Least distance (m) of two points of a bar that is none of ``others``."""
+        if others not in self._known_nearest:
+            self._known_nearest[others] = min(
+                (
+                    self._apart(a, b)
+                    for name, bar in self.bars.items()
+                    if name not in others
+                    for a, b in combinations(bar.points, 2)
+                ),
+                default=math.inf,
+            )
+        return self._known_nearest[others]
 
     # -- checks ------------------------------------------------------------------------------
 
@@ -126,11 +217,6 @@ class Drawing:
         if name not in self.points:
             raise fault(element, f"there is no point {name!r}", known_names(self.points))
         return self.points[name]
-
-    @cached_property
-    def size(self) -> float:
-        """Diagonal (m) of the drawing."""
-        return float(np.linalg.norm(np.ptp(self._drawn, axis=0)))
 
     def _check_ground(self) -> None:
         if not self.ground and all(slider.on for slider in self.entry.slider):
@@ -212,11 +298,6 @@ class Drawing:
 
     # -- geometry ----------------------------------------------------------------------------
 
-    @cached_property
-    def _places(self) -> dict[str, tuple[float, float]]:
-        """The points as plain numbers."""
-        return {name: (x, y) for name, (x, y) in zip(self.points, self._drawn.tolist())}
-
     def _apart(self, a: str, b: str) -> float:
         """Distance (m) of two points as drawn."""
         return math.dist(self._places[a], self._places[b])
@@ -270,13 +351,16 @@ class Drawing:
         others = [name for name in points if name != point]
         self.bars[bar] = self.bars[bar].model_copy(update={"points": [point, *others]})
         self._shapes[bar] = self._shape(self.bars[bar])
+        self._angles.pop(bar, None)
 
     def body_angle(self, body: str) -> float:
         """Angle (rad) of the x axis of a body as drawn: of a bar, from the first to the second of
         its points; of a slider, that of the bar on which it slides."""
         if body in self.bars:
-            first, second = self.bars[body].points[:2]
-            return direction_angle(self.points[second] - self.points[first])
+            if body not in self._angles:
+                first, second = self.bars[body].points[:2]
+                self._angles[body] = direction_angle(self.points[second] - self.points[first])
+            return self._angles[body]
         on = self.sliders[body].on if body in self.sliders else ""
         return self.body_angle(on) if on else 0.0
 

@@ -13,7 +13,8 @@ from there to the next of its points: the angle of a pin on the ground is that o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from types import MappingProxyType
@@ -36,7 +37,7 @@ from srm_mbs.formats.graph.joint_graph import (
     spanning_tree,
 )
 from srm_mbs.formats.graph.spanning_tree_to_urdf import IDENTITY_ROUNDING, closure, urdf_tree
-from srm_mbs.formats.planar.drawing import Drawing, fault, listed
+from srm_mbs.formats.planar.drawing import Change, Drawing, fault, listed
 from srm_mbs.formats.planar.shapes import (
     GREY,
     PALETTE,
@@ -52,8 +53,9 @@ from srm_mbs.formats.planar.shapes import (
     turned,
 )
 from srm_mbs.formats.planar.variants import model_of_variant, plain_parts
+from srm_mbs.formats.toml.parameters import Place
 from srm_mbs.formats.toml.schema import PlanarEntry, PlanarSlider
-from srm_mbs.formats.translation import Options, Translation, urdf_text
+from srm_mbs.formats.translation import PLANAR, Numbers, Options, Translation, urdf_text
 from srm_mbs.model.anchors import WORLD
 
 HINGE_AXIS = (0.0, -1.0, 0.0)
@@ -336,9 +338,10 @@ class _Linkage:
             lambda: urdf_text(self._urdf(drawn=True)),
             entries,
             tuple(self._notes()),
-            check=self._check,
+            check=self.check,
             parts=plain_parts(bodies, joints) if model is None else None,
             model=model,
+            vary=self.variants if model is None else None,
         )
 
     @cached_property
@@ -499,7 +502,7 @@ class _Linkage:
                 "them there"
             )
 
-    def _check(self, mechanism: Mechanism) -> None:
+    def check(self, mechanism: Mechanism) -> None:
         """Refuse a linkage that cannot move."""
         if mechanism.degrees_of_freedom == 0 and not mechanism.drives:
             raise fault(
@@ -507,6 +510,112 @@ class _Linkage:
                 "they form a structure: the linkage has no degree of freedom",
                 "Remove a bar, or a point from ground, or let a pin slide",
             )
+
+    # -- variants ------------------------------------------------------------------------------
+
+    def variants(self, places: Sequence[Place]) -> LinkageVariants | None:
+        """The variants whose numbers at ``places`` of the description vary; None where they change
+        more than points, masses and the start."""
+        change = self._change(places)
+        return None if change is None else LinkageVariants(self, change, tuple(places))
+
+    def _change(self, places: Sequence[Place]) -> Change | None:
+        """All that the numbers at ``places`` of the description may change; None where that is more
+        than points, masses and the start."""
+        entry, points, bars, masses = self.entry, set[str](), set[str](), set[str]()
+        for section, *place in places:
+            match place if section == PLANAR else ():
+                case ["points", str(name), _]:
+                    points.add(name)
+                case ["bar", int(i), str(key), *_] if key in NUMBERS_OF_BARS:
+                    (bars if key == "length" else masses).add(entry.bar[i].name)
+                case ["slider", int(i), "mass" | "inertia"]:
+                    masses.add(entry.slider[i].name)
+                case ["length", int(i), "length"]:
+                    ends = set(entry.length[i].between)
+                    bars.update(bar.name for bar in entry.bar if ends <= set(bar.points))
+                case ["mass_per_length"]:
+                    masses.update(bar.name for bar in entry.bar)
+                case ["start" | "rates", str()]:
+                    pass
+                case _:
+                    return None
+        bars.update(bar.name for bar in entry.bar if not points.isdisjoint(bar.points))
+        for slider in entry.slider:
+            if slider.point in points or slider.on in bars:
+                bars.add(slider.name)
+        return Change(frozenset(points), frozenset(bars), frozenset(masses))
+
+    @staticmethod
+    def _varies(body: str, point: str, change: Change) -> bool:
+        """Whether a point may be elsewhere in a body."""
+        return body in change.bodies or point in change.points
+
+    def varied(self, entry: PlanarEntry, change: Change) -> _Linkage | None:
+        """The same linkage with the numbers of ``entry``; None as for :meth:`Drawing.varied`."""
+        drawing = self.drawing.varied(entry, change)
+        if drawing is None:
+            return None
+        out = copy(self)
+        out.entry, out.drawing = entry, drawing
+        out.origins = dict(self.origins)
+        for joint in self.joints:
+            point = self._point(joint)
+            if self._varies(joint.child, point, change):
+                out.origins[joint.child] = drawing.on_body(joint.child, out._drawn(joint), point)
+        out._local_places = {
+            place: at
+            for place, at in self._local_places.items()
+            if not self._varies(*place, change)
+        }
+        return out
+
+    def numbers(self, first: _Linkage, change: Change) -> Numbers | None:
+        """The numbers that differ from those of the linkage ``first``, of which this is a variant;
+        None if an axis differs, or whether a body has mass."""
+        moved = []
+        for own, placed in zip(self.joints, first._parts[1]):
+            varies = self._varies(own.parent, self._point(own), change)
+            if varies or own.type != "revolute":
+                joint = self._placed(own)
+                if joint.axis != placed.axis:
+                    return None
+                if varies:
+                    moved.append(joint)
+        heavier = {}
+        for body in first._parts[0]:
+            if body.name in change.bodies or body.name in change.masses:
+                inertia = self._inertia(body.name)
+                if (inertia is None) != (body.inertia is None):
+                    return None
+                if inertia is not None:
+                    heavier[body.name] = inertia
+        closures = {}
+        for joint in self.cut:
+            if joint.type != "revolute":
+                slider = self.drawing.sliders[joint.name]
+                if self._line(slider) != first._line(slider):
+                    return None
+            point = self._point(joint)
+            if self._varies(joint.child, point, change) or self._varies(
+                joint.parent, point, change
+            ):
+                closures[joint.name] = (
+                    self._anchor(joint.child, point),
+                    self._anchor(joint.parent, point),
+                )
+        points = {
+            point: self._anchor(body, point)
+            for point, body in self.connections.hubs.items()
+            if self._varies(body, point, change)
+        }
+        forces: dict[str, dict[str, Any]] = {
+            table["name"]: {key: table[key] for key in ("a", "b", "at") if key in table}
+            for table in self._forces()
+            if table["type"] != "torque"
+        }
+        notes = tuple(self._notes())
+        return Numbers(moved, heavier, closures, points, forces, self._initial(), notes)
 
     # -- visuals -------------------------------------------------------------------------------
 
@@ -560,3 +669,50 @@ class _Linkage:
                 )
                 reach = 0.25 * self.drawing.size * along
                 yield rod(at - reach, at + reach, 0.25 * width, GREY)
+
+
+# -- variants ------------------------------------------------------------------------------------
+
+NUMBERS_OF_BARS = ("length", "mass", "mass_per_length", "inertia", "centre")
+"""Keys of a bar whose numbers may vary while the rest of the linkage is kept."""
+
+
+class LinkageVariants:
+    """The numbers of the variants of a linkage: what they do not change is taken over.
+
+    Parameters
+    ----------
+    linkage
+        The linkage that was read first, translated.
+    change
+        What they may change.
+    places
+        Their numbers in the description.
+    """
+
+    def __init__(self, linkage: _Linkage, change: Change, places: tuple[Place, ...]) -> None:
+        self._linkage, self._change, self._places = linkage, change, places
+
+    def __call__(self, entry: PlanarEntry) -> Numbers | None:
+        """The numbers of a variant with the section ``entry``; None where it has to be read as a
+        whole, because of a fault perhaps."""
+        varied = self._linkage.varied(entry, self._change)
+        return None if varied is None else varied.numbers(self._linkage, self._change)
+
+    def check(self, mechanism: Mechanism) -> None:
+        """Refuse a linkage that cannot move."""
+        self._linkage.check(mechanism)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Without the checked section, whose tables may have classes made at run time."""
+        options = self._linkage.options
+        return _variants_again, (dict(options.own), options.cut, self._places)
+
+
+def _variants_again(
+    own: dict[str, Any], cut: tuple[str, ...], places: tuple[Place, ...]
+) -> LinkageVariants | None:
+    entry = PlanarEntry.model_validate(own[PLANAR])
+    linkage = _Linkage(entry, Options(cut, own, planar=entry))
+    linkage.translation()
+    return linkage.variants(places)

@@ -73,8 +73,9 @@ def _own_axes(shape: tuple[int, ...], numbers: bytes) -> FloatArray:
     # With plain numbers, because NumPy takes ten times as long for so few.
     c, s = float(np.cos(-angle)), float(np.sin(-angle))
     along = (points - points[0]).tolist()
-    out = np.array([[c * x - s * y, s * x + c * y] for x, y in along])
-    out[np.abs(out) < COLLINEAR * np.abs(out).max()] = 0.0
+    places = [(c * x - s * y, s * x + c * y) for x, y in along]
+    rounding = COLLINEAR * max(max(abs(x), abs(y)) for x, y in places)
+    out = np.array([[0.0 if abs(a) < rounding else a for a in place] for place in places])
     out.setflags(write=False)
     return out
 
@@ -124,7 +125,8 @@ def outline(points: FloatArray) -> list[tuple[int, int]]:
         return [(0, 1)]
     at = points.tolist()
     order = sorted(range(len(at)), key=at.__getitem__)
-    rounding = COLLINEAR * float(np.ptp(points, axis=0).max()) ** 2
+    (left, right), (bottom, top) = ((min(side), max(side)) for side in zip(*at))
+    rounding = COLLINEAR * max(right - left, top - bottom) ** 2
 
     def chain(indices: Iterable[int]) -> list[int]:
         found: list[int] = []

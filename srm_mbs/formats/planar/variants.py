@@ -7,8 +7,7 @@ would compute them; texts, the check of the XML and Pinocchio's reader are left 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -17,11 +16,9 @@ from srm_mbs._kernel.workspace import share_scratch
 from srm_mbs.formats.graph.joint_graph import Body, Joint
 from srm_mbs.formats.graph.spanning_tree_to_urdf import is_identity
 from srm_mbs.formats.translation import KnownTree, TreeParts
-from srm_mbs.formats.urdf.validation import doubtful_moments
-from srm_mbs.model.numbers import LARGEST_MAGNITUDE
+from srm_mbs.formats.urdf.variants import inertia_as_read, plain_numbers
 
-KEPT_BODIES = 1024
-"""Inertias that are kept: variants of a linkage have most of them in common."""
+UNTURNED = np.eye(3)
 
 
 def plain_parts(bodies: Sequence[Body], joints: Sequence[Joint]) -> TreeParts | None:
@@ -29,23 +26,8 @@ def plain_parts(bodies: Sequence[Body], joints: Sequence[Joint]) -> TreeParts | 
     fault about its numbers."""
     parts = TreeParts(bodies, joints)
     inertias = [body.inertia for body in bodies if body.inertia is not None]
-    plain = inertias and joints and _plain(inertias, [joint.in_parent for joint in joints])
+    plain = inertias and joints and plain_numbers(inertias, [joint.in_parent for joint in joints])
     return parts if plain else None
-
-
-def _plain(inertias: Sequence[pin.Inertia], places: Sequence[pin.SE3]) -> bool:
-    """Whether the numbers of a tree are those of real bodies, and of sensible size."""
-    numbers = [place.translation for place in places]
-    if inertias:
-        masses = np.array([inertia.mass for inertia in inertias])
-        tensors = np.array([inertia.inertia for inertia in inertias])
-        if not (masses >= 0.0).all():
-            return False
-        negative, impossible = doubtful_moments(np.linalg.eigvalsh(tensors), masses)
-        if negative.any() or impossible.any():
-            return False
-        numbers += [masses, tensors.ravel(), *(inertia.lever for inertia in inertias)]
-    return not numbers or bool(np.abs(np.concatenate(numbers)).max() <= LARGEST_MAGNITUDE)
 
 
 def model_of_variant(
@@ -67,21 +49,29 @@ def model_of_variant(
     moved = [
         joint for joint, own in zip(joints, known.parts.joints) if joint.in_parent != own.in_parent
     ]
-    if not _plain(list(heavier.values()), [joint.in_parent for joint in moved]):
+    return model_with(known, moved, heavier)
+
+
+def model_with(
+    known: KnownTree, moved: Sequence[Joint], inertias: Mapping[str, pin.Inertia]
+) -> pin.Model | None:
+    """The model of ``known`` with other translations of the joints ``moved`` and other ``inertias``
+    of links, by name; None where the check of a tree would say something about them."""
+    if not plain_numbers(list(inertias.values()), [joint.in_parent for joint in moved]):
         return None
     model = known.model.copy()
     share_scratch(known.model, model)
     for joint in moved:
-        number = model.getJointId(joint.name)
+        number = known.numbers[joint.child]
         place = joint.in_parent
         at = np.zeros(3) if is_identity(place) else place.translation + 0.0
         model.jointPlacements[number] = pin.SE3(model.jointPlacements[number].rotation, at)
-    for joint in joints:
-        inertia = heavier.get(joint.child)
-        if inertia is not None:
-            model.inertias[model.getJointId(joint.name)] = _as_read(
-                inertia.mass, inertia.lever.tobytes(), inertia.inertia.tobytes()
-            )
+    for link, inertia in inertias.items():
+        centre = pin.SE3(UNTURNED, inertia.lever)
+        lever = np.zeros(3) if is_identity(centre) else inertia.lever
+        model.inertias[known.numbers[link]] = inertia_as_read(
+            inertia.mass, lever.tobytes(), inertia.inertia.tobytes()
+        )
     return model
 
 
@@ -101,16 +91,3 @@ def _same_tree(known: TreeParts, bodies: Sequence[Body], joints: Sequence[Joint]
         and one.axis == own.axis
         for one, own in zip(joints, known.joints)
     )
-
-
-@lru_cache(maxsize=KEPT_BODIES)
-def _as_read(mass: float, lever_numbers: bytes, tensor_numbers: bytes) -> pin.Inertia:
-    """An inertia as Pinocchio's reader of URDF rounds it; nothing may change it."""
-    lever, tensor = np.frombuffer(lever_numbers), np.frombuffer(tensor_numbers)
-    if is_identity(pin.SE3(np.eye(3), lever)):
-        lever = np.zeros(3)
-    # The reader adds the body twice to one without mass.
-    one = mass * (1.0 / (mass or 1.0))
-    body = pin.Inertia(mass, one * (one * (lever + 0.0)), np.zeros((3, 3)))
-    body.inertia = tensor.reshape((3, 3)) + 0.0
-    return pin.SE3.Identity().act(body)

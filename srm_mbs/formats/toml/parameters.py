@@ -305,6 +305,11 @@ class _Tables:
         return id(self.entries)
 
 
+def expressions(entries: Mapping[str, Any]) -> tuple[Place, ...]:
+    """Where the tables of a description have expressions, but for those of its parameters."""
+    return _expressions(_Tables(entries))
+
+
 @lru_cache(maxsize=4)
 def _expressions(tables: _Tables) -> tuple[Place, ...]:
     """Where the tables have expressions, but for those of parameters."""

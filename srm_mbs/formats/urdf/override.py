@@ -100,16 +100,31 @@ def _change_link(
             remedy="Give it an <inertial> with <mass> and <inertia>",
         )
     link = f"link {node.get('name')!r}"
-    value = entry.scale * checker.number(mass, "value", link) + entry.mass
+    moments = [checker.number(inertia, key, link) for key in TENSOR]
+    value, moments = changed_inertial(entry, checker.number(mass, "value", link), moments)
     if value < 0.0:
         raise InputError(
             f"the mass becomes {value:g} kg", file=file, element=where, remedy="Give a larger mass"
         )
     mass.set("value", repr(value))
-    factor = entry.scale * entry.inertia_scale
-    for key, more in zip(TENSOR, entry.inertia):
-        inertia.set(key, repr(factor * checker.number(inertia, key, link) + more))
+    for key, moment in zip(TENSOR, moments):
+        inertia.set(key, repr(moment))
     _move_origin(inertial, 1.0, entry.xyz, link, checker)
+
+
+def changed_inertial(
+    entry: OverrideEntry, mass: float, moments: Iterable[float]
+) -> tuple[float, list[float]]:
+    """The mass (kg) and the moments (kg m^2), in the order of :data:`TENSOR`, of a link with an
+    entry."""
+    factor = entry.scale * entry.inertia_scale
+    changed = [factor * own + more for own, more in zip(moments, entry.inertia)]
+    return entry.scale * mass + entry.mass, changed
+
+
+def changed_place(place: Iterable[float], scale: float, offset: Iterable[float]) -> list[float]:
+    """``place`` (3,) m times ``scale``, moved by ``offset`` (3,) m."""
+    return [scale * own + more for own, more in zip(place, offset)]
 
 
 def _move_origin(
@@ -118,7 +133,7 @@ def _move_origin(
     """Multiply the place of ``<origin>`` of ``node`` by ``scale``, and add ``offset``."""
     origin = node.find("origin")
     given = checker.vector_or_zero(origin, "xyz", where)
-    place = [scale * own + more for own, more in zip(given, offset)]
+    place = changed_place(given, scale, offset)
     if place == given:
         return
     if origin is None:

@@ -58,10 +58,16 @@ class CompiledRecord(RunRecord):
         return self.run.core.take_records(*start)
 
     def nodes(self) -> tuple[FloatArray, FloatArray] | None:
-        """Times (n + 1,) s and states (n + 1, nx) at the ends of the steps, without a terminal
-        event; None before :meth:`close`."""
+        """Times (n + 1,) s and states (n + 1, nx) at the ends of the steps, or at a terminal event
+        in the only one; None before :meth:`close`, and where dense output has to find the state of
+        the event."""
         records = self._records
-        return None if records is None else (records.times, records.states)
+        if records is None or self.stop is None:
+            return None if records is None else (records.times, records.states)
+        times, states = records.times, records.states
+        if len(times) != 2:
+            return None
+        return np.array([times[0], self.stop]), np.array([states[0], self.stop_state])
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""

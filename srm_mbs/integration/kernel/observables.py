@@ -13,7 +13,7 @@ from srm_mbs._kernel.workspace import LARGE
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.reactions import Reactions, named_reactions
-from srm_mbs.dynamics.constraints.rheonomic import all_rows
+from srm_mbs.dynamics.constraints.rheonomic import all_rows, constraint_errors
 from srm_mbs.dynamics.constraints.row_algebra import INERT, SingularValues, active_rows
 from srm_mbs.dynamics.forces import ForceKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
@@ -51,8 +51,8 @@ class _Lent:
 
     __slots__ = ("_idle", "_kernel_system", "_mechanism")
 
-    def __init__(self, observables: CompiledObservables) -> None:
-        self._idle, self._mechanism = observables.idle, observables.mechanism
+    def __init__(self, idle: deque[Any], mechanism: Mechanism) -> None:
+        self._idle, self._mechanism = idle, mechanism
 
     def __enter__(self) -> Any:
         try:
@@ -63,6 +63,18 @@ class _Lent:
 
     def __exit__(self, *_: object) -> None:
         self._idle.append(self._kernel_system)
+
+
+def closure_errors(
+    mechanism: Mechanism, t: FloatArray, q: FloatArray, v: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """As :func:`~srm_mbs.dynamics.constraints.rheonomic.constraint_errors`, of a mechanism without
+    drives: their rows begin with its initial state."""
+    try:
+        with _Lent(_idle_all_rows(mechanism), mechanism) as kernel_system:
+            return kernel_system.closure_errors(*_states(t, q, v))  # type: ignore[no-any-return]
+    except ArithmeticError:
+        return constraint_errors(mechanism, t, q, v)  # raises the error that says why
 
 
 class CompiledObservables(Observables):
@@ -84,7 +96,7 @@ class CompiledObservables(Observables):
 
     def _all_rows(self) -> _Lent:
         """A kernel system of :func:`_make_all_rows` for one user."""
-        return _Lent(self)
+        return _Lent(self.idle, self.mechanism)
 
     @property
     def _calls_python(self) -> bool:
@@ -95,11 +107,13 @@ class CompiledObservables(Observables):
     def closure_errors(
         self, t: FloatArray, q: FloatArray, v: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
+        if not self.mechanism.drives:
+            return closure_errors(self.mechanism, t, q, v)
         try:
             with self._all_rows() as kernel_system:
                 return kernel_system.closure_errors(*_states(t, q, v))  # type: ignore[no-any-return]
         except ArithmeticError:
-            return super().closure_errors(t, q, v)  # raises the error that says why
+            return super().closure_errors(t, q, v)
 
     def jacobians(self, t: FloatArray, q: FloatArray) -> FloatArray:
         times, places = np.ascontiguousarray(t, dtype=float), np.ascontiguousarray(q)

@@ -217,7 +217,7 @@ class CompiledRun:
         last = self.core.last()
         if last.in_zone or last.critical:
             return by_reference()
-        own = scheme.member(self.core.last().stiff)
+        own = scheme.member(last.stiff)
         compiled = self.core.step_dense(start, *marshalling.dense_structs(own))
 
         def states(times: FloatArray) -> FloatArray:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
+
+import numpy as np
 
 from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
@@ -92,6 +94,31 @@ class workspace:  # noqa: N801 - used as a function
             core.leave_python()  # type: ignore[union-attr]
 
 
+class SuccessiveWorkspaces(ExitStack):
+    """Kernel systems for one user, who needs one after the other: the same as long as the equations
+    of motion are."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._system: ClosedSystem | OpenSystem | None = None
+        self._kernel_system: Any = None
+
+    def of(self, system: ClosedSystem | OpenSystem, code: Any) -> Any:
+        """That of ``system``, as new; ``code`` as for :func:`make_kernel_system`."""
+        if system is self._system:
+            self._kernel_system.renew(**system.constants_of_start())
+        else:
+            self._system = None
+            self.close()
+            self._kernel_system = self.enter_context(workspace(system, code))
+            self._system = system
+        return self._kernel_system
+
+    def evaluator(self, system: ClosedSystem | OpenSystem) -> Evaluator | ClosedSystem | OpenSystem:
+        """``system``, evaluated by its kernel system, if this was asked for that last."""
+        return Evaluator(system, self._kernel_system) if system is self._system else system
+
+
 def _idle_or_new(system: ClosedSystem | OpenSystem, code: Any) -> Any:
     if shared(system):
         with suppress(IndexError):  # deque: two threads never get the same
@@ -145,6 +172,14 @@ class Evaluator:
         """Begin a step of both from ``state`` at ``t`` (s)."""
         self.system.begin_step(t, state)
         self.kernel_system.begin_step(t, state)
+
+    def residuals(self, state: FloatArray, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """As :meth:`~srm_mbs.dynamics.multibody.ClosedSystem.residuals`."""
+        try:
+            g, c = self.kernel_system.closure_errors(np.array([t]), state[None])
+        except ArithmeticError:
+            return self.system.residuals(state, t)  # raises the error that says why
+        return g[0], c[0]
 
     def branch_nodes(self, norm: ErrorNorm) -> CompiledNodes:
         """Makes the nodes of the motion next to a singular configuration."""

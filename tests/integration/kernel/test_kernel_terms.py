@@ -11,7 +11,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.integration.kernel import backend
-from srm_mbs.integration.kernel.system import make_kernel_system
+from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
 from tests.support.mechanisms import along_x, rod
 
 pytestmark = pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}")
@@ -116,6 +116,9 @@ def _agrees_with_the_reference(mechanism: srm.Mechanism) -> None:
         size = np.abs(terms.rate()).max()
         assert np.abs(found["rate"] - terms.rate()).max() < 1e-13 * size / terms.sigma
         assert found["sigma"] == pytest.approx(terms.sigma, rel=1e-12)
+        residuals = Evaluator(system, kernel_system).residuals(state)
+        for found_ones, own in zip(residuals, system.residuals(state)):
+            assert np.abs(found_ones - own).max() < 1e-14 * (1.0 + np.abs(state).max())
 
 
 def _resident() -> float:

@@ -1,0 +1,97 @@
+"""Impacts: velocities that change at once, by impulses along a normal and along the closures."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from srm_mbs._kernel.workspace import LARGE
+from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
+from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
+from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.model.mechanism import per_model
+from srm_mbs.model.numbers import finite_array
+from srm_mbs.model.validation import checked_start
+
+SMALLEST_GAIN = 1e-12
+"""Response of n.v to an impulse along n, over that without closures, below which the closures do
+not let the mechanism move along n."""
+
+
+@per_model
+def _idle_systems(mechanism: Mechanism) -> deque[OpenSystem | ClosedSystem]:
+    """The equations of motion that an impact left: their parts that depend on the start do not
+    matter to impulses."""
+    return deque(maxlen=1)
+
+
+def impact(
+    mechanism: Mechanism, q: Any, v: Any, normal: Any, restitution: float = 0.0
+) -> FloatArray:
+    """Velocities after an impact that closures take part in.
+
+    An impulse acts along ``normal`` and along the closures, so that the rate n.v turns into
+    -e n.v while G v = 0 stays: v + a mu with a = (1 - P) M^{-1} n (Newton's law of restitution).
+
+    Parameters
+    ----------
+    mechanism
+        What is hit.
+    q : (nq,), v : (nv,)
+        State before.
+    normal : (nv,)
+        n: gradient of the distance to the stop in the coordinates of v.
+    restitution
+        e, from 0 (it stays) to 1 (elastic).
+
+    Returns
+    -------
+    v : (nv,)
+
+    Raises
+    ------
+    InputError
+        For another shape, a restitution that is none, or if the closures do not let the mechanism
+        move along ``normal``.
+    EvaluationError
+        If the mass matrix is not positive definite, or a closure has no direction at q.
+    """
+    check_mechanism(mechanism)
+    share = finite_array(restitution, ())
+    if share is None or not 0.0 <= share <= 1.0:
+        raise InputError(
+            f"restitution = {safe_repr(restitution)} is not between 0 and 1",
+            element="restitution",
+            remedy="Give 0 (nothing springs back) to 1 (all of it)",
+        )
+    q, v = checked_start(mechanism.model, q, v)
+    remedy = f"Give {len(v)} numbers"
+    n = finite_array(normal)
+    if n is None:
+        raise InputError(
+            f"normal = {safe_repr(normal)} does not consist of finite numbers",
+            element="normal",
+            remedy=remedy,
+        )
+    if n.shape != v.shape:
+        raise InputError(
+            f"normal has shape {n.shape}, not {v.shape}", element="normal", remedy=remedy
+        )
+    idle = _idle_systems(mechanism)
+    try:
+        system = idle.pop()  # two threads never get the same
+    except IndexError:
+        system = make_system(mechanism)
+    along, free = system.impulse_response(q, n)
+    if mechanism.model.nv <= LARGE:
+        idle.append(system)
+    gain = float(n @ free)
+    if not gain > SMALLEST_GAIN * float(n @ along):
+        raise InputError(
+            "the closures do not let the mechanism move along this normal",
+            element="normal",
+            remedy="Give the gradient of the gap, which some motion of the mechanism changes",
+        )
+    out: FloatArray = v - (1.0 + float(share)) * float(n @ v) / gain * free
+    return out

@@ -14,7 +14,7 @@ checkout.
     loops       N-four-bars: an evaluation, mean over 8 states of a run, and the run itself, 1.2 s
                 through the first passage at rtol 1e-8; and the evaluation without generated code,
                 which has its limit between 160 and 320 loops
-    compile     CPU seconds of ``srm.compile`` into an empty cache, and of loading; here only
+    compile     CPU seconds of compiling into an empty cache, and of loading from it; here only
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ RUNS = [
 
 # In each interpreter: reads cases, one a line, and answers each with the least time of a few calls.
 WORKER = r'''
-import gc, json, os, shutil, sys, tempfile, time
+import gc, json, resource, sys, time
 import numpy as np
 import srm_mbs as srm
 
@@ -117,13 +117,18 @@ def mean(name, by="generated"):
     system = kernel_system(mechanism, by)
     return float(np.mean([least(lambda: system.repeat(0.0, s, 5), 0.01) for s in chosen])) / 5
 
-def compilation(name, again):
+def used():
+    """CPU seconds of this process and of its compilers."""
+    by = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(own.ru_utime + own.ru_stime for own in by)
+
+def compilation(name):
     if not generates:
         return None
     mechanism = loaded(name)
-    before = sum(os.times()[:4])
-    srm.compile(mechanism)
-    return sum(os.times()[:4]) - before
+    before = used()
+    load_code(mechanism)
+    return used() - before
 
 for line in sys.stdin:
     kind, *arguments = json.loads(line)
@@ -174,9 +179,9 @@ def compile_times(python: str, names: tuple[str, ...]) -> None:
     for name in names:
         with tempfile.TemporaryDirectory() as cache:
             found = []
-            for again in (False, True):
+            for _ in range(2):
                 interpreter = Interpreter(python, cache)
-                found.append(interpreter.measure("compilation", name, again))
+                found.append(interpreter.measure("compilation", name))
                 interpreter.close()
         print(f"{name:44s} {found[0]:12.3f} {found[1]:12.4f}", flush=True)
 

@@ -19,6 +19,7 @@
 #include <vector>
 
 #include "bit_sets.hpp"
+#include "large_array.hpp"
 #include "projection.hpp"
 
 namespace srm {
@@ -54,7 +55,7 @@ protected:
     // Computes pivots_, Q and R, and clears the columns of W.
     virtual void pivoted_qr(double floor);
     // G^T, then W, column by column; between evaluations zero outside the supports of the rows.
-    std::vector<double> A_;
+    LargeArray A_;
     // Rows of W's columns, ascending, with all ancestors.
     std::vector<int> support_start_, support_;
     // Squared norms of what is left of W's columns, and of the whole columns; entries below least_

@@ -67,8 +67,8 @@ SweptProjection::SweptProjection(int structural_rank, double sigma_ref, const Pa
 
 // Copies the columns of W into the working rows, and clears them.
 void SweptProjection::take_columns() {
-    rows_of_ = first_rows_of_;
-    columns_of_ = first_columns_of_;
+    rows_of_.restore(first_rows_of_);
+    columns_of_.restore(first_columns_of_);
     for (int j = 0; j < rows; ++j) {
         const int from = column_at_[j];
         double* const a = column(from);
@@ -295,7 +295,7 @@ void SweptProjection::reflect_pair(int one, int two, double second, double tau) 
     const double* const least = small_.data();
     const Word *const in_a = columns_of_.words(one), *const in_b = columns_of_.words(two);
     // A change of along v has the length |along| |v|.
-    const double length = std::sqrt(2.0 / tau);
+    const double length = std::sqrt(1.0 + second * second);
     const int from = std::min(columns_of_.first[one], columns_of_.first[two]);
     const int to = std::max(columns_of_.last[one], columns_of_.last[two]);
     for (int w = from; w <= to; ++w) {
@@ -346,10 +346,8 @@ void SweptProjection::reflect_rows(const int* at, const double* v, int n, double
     }
 }
 
-// Columns of word w that have an entry in a row from now on.
-void SweptProjection::enter(int row, Word columns, int w) {
+void SweptProjection::enter_fresh(int row, Word columns, int w) {
     const Word fresh = columns & ~columns_of_.words(row)[w];
-    if (!fresh) return;
     columns_of_.add(row, fresh, w);
     each_bit(fresh & open_columns_[w], w << 6, [&](int j) { rows_of_.set(j, row); });
 }

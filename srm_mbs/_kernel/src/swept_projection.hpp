@@ -36,7 +36,11 @@ private:
     void reflect(const int* at, double* v, int n);
     void reflect_pair(int one, int two, double second, double tau);
     void reflect_rows(const int* at, const double* v, int n, double tau);
-    void enter(int row, Word columns, int w);
+    // Columns of word w that have an entry in a row from now on.
+    void enter(int row, Word columns, int w) {
+        if (columns & ~columns_of_.words(row)[w]) enter_fresh(row, columns, w);
+    }
+    void enter_fresh(int row, Word columns, int w);
     void take_right(int column, int pivot);
     void clear_rows();
     double* row(int i) { return &values_[static_cast<std::size_t>(i) * rows]; }
@@ -48,7 +52,7 @@ private:
     std::vector<int> row_place_;
     // Working rows (nv, rows) of the working columns, zero outside their rows.  open_columns_ are
     // those to come in the sweep.
-    std::vector<double> values_;
+    LargeArray values_;
     // Columns of this sweep, ascending; those deferred to the next one; those in the window.
     std::vector<int> waiting_, deferred_, window_;
     // Of each working column: size up to which entries are negligible, squared norm of what is

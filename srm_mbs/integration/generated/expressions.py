@@ -142,6 +142,8 @@ class Recorder:
         # Of a sum and one of its terms, the other term is left, without rounding.
         if a.operation == "+" and b in a.operands:
             return a.operands[1] if a.operands[0] is b else a.operands[0]
+        if a.operation == "-" and a.operands[0] is b:
+            return self.negate(a.operands[1])
         if b.operation == "+" and a in b.operands:
             return self.negate(b.operands[1] if b.operands[0] is a else b.operands[0])
         if a.depends == CONSTANT:

@@ -1,14 +1,17 @@
 r"""The terms of an evaluation of a mechanism, recorded and written as C.
 
-One pass over the tree, in world axes about the world's origin.  With the columns J_k of a joint's
-motions, V and A the spatial velocity and bias acceleration of its body, and p its parent,
+One pass over the tree, in world axes.  With the columns J_k of a joint's motions about the world's
+origin, V the spatial velocity of its body, p its parent, and u, w its linear and angular velocity
+against the parent, the accelerations without those of rates are
 
-    V = V_p + sum J_k v_k,     A = A_p + V_p x sum J_k v_k,     A_0 = -gravity,
-    F = (m a, c x m a + I \alpha + \omega x I \omega),     nle_k = J_k . (sum of F over the subtree)
+    V = V_p + sum J_k v_k,     \alpha = \alpha_p + \omega_p x w,     a_0 = -gravity,
+    a(x) = a(o) + ([\alpha] + [\omega]^2) (x - o),     a(o) = a_p(o) + (\omega_p + \omega) x u,
+    F = (m a(c), c x m a(c) + I \alpha + \omega x I \omega),
+    nle_k = J_k . (sum of F over the subtree),
     M_jk = J_j . (Y J_k)   for j on the way from the ground to k,
 
-with c, I mass centre and moments of the body, a the acceleration of the mass centre and Y the
-inertia of the subtree of k: these are Newton's and Euler's equations and the composite rigid-body
+with o the origin of the body, c, I its mass centre and moments, and Y the inertia of the subtree of
+k: these are Newton's and Euler's equations and the composite rigid-body
 algorithm (R. Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 5 and 6), as Pinocchio
 has them.  The rows are those of :mod:`srm_mbs.dynamics.constraints.rows`, the forces those of
 :mod:`srm_mbs.dynamics.forces`.
@@ -70,7 +73,8 @@ class Column(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A body in world axes; velocity and acceleration are of its point at the world's origin."""
+    """A body in world axes; the velocity is of its point at the world's origin, the acceleration of
+    its own origin."""
 
     rotation: Matrix
     origin: Vector
@@ -78,6 +82,8 @@ class Body(NamedTuple):
     spin: Vector
     bias: Vector
     spin_bias: Vector
+    gradient: Matrix
+    """Of the acceleration, by the place of a point: :func:`gradient_of`."""
 
     def point(self, local: Vector) -> Vector:
         """The place of a point of the body."""
@@ -89,8 +95,18 @@ class Body(NamedTuple):
 
     def point_bias(self, x: Vector) -> Vector:
         """Acceleration of its point at ``x``, without those of the joints."""
-        carried = cross(self.spin, self.point_velocity(x))
-        return add(add(self.bias, cross(self.spin_bias, x)), carried)
+        return add(self.bias, times(self.gradient, subtract(x, self.origin)))
+
+
+def gradient_of(spin: Vector, spin_bias: Vector) -> Matrix:
+    """[alpha] + [omega]^2, with the matrices of cross products."""
+    (x, y, z), (a, b, c) = spin, spin_bias
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    return (
+        (-(yy + zz), xy - c, xz + b),
+        (xy + c, -(xx + zz), yz - a),
+        (xz - b, yz + a, -(xx + yy)),
+    )
 
 
 class Inertia(NamedTuple):
@@ -140,13 +156,15 @@ class Trace:
         self.nothing: Vector = (zero, zero, zero)
         self.units: Matrix = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
         gravity = self.take(structure.gravity)
+        spin_bias = -gravity[3], -gravity[4], -gravity[5]
         self.ground = Body(
             self.units,
             self.nothing,
             self.nothing,
             self.nothing,
             (-gravity[0], -gravity[1], -gravity[2]),
-            (-gravity[3], -gravity[4], -gravity[5]),
+            spin_bias,
+            gradient_of(self.nothing, spin_bias),
         )
         self.accelerations = [zero] * structure.nv
         """Those of the rates; without them, terms are nonlinear effects and bias."""
@@ -286,30 +304,25 @@ class Trace:
         rotation = product(before, turned)
         origin = add(parent.point(at), times(before, moved))
         own = []
-        linear, angular = self.nothing, self.nothing
+        linear, angular, ahead = self.nothing, self.nothing, self.nothing
+        bias, spin_bias = parent.point_bias(origin), parent.spin_bias
         for i, (shift, turn) in enumerate(subspace, motion.in_v):
-            ahead, about = times(rotation, shift), times(rotation, turn)
-            column = Column(i, add(ahead, cross(origin, about)), about)
+            along, about = times(rotation, shift), times(rotation, turn)
+            column = Column(i, add(along, cross(origin, about)), about)
             own.append(column)
             linear = add(linear, scaled(self.v[i], column.linear))
-            angular = add(angular, scaled(self.v[i], column.angular))
-        spin = parent.spin
-        bias = add(cross(spin, linear), cross(parent.velocity, angular))
-        spin_bias = cross(spin, angular)
-        for column in own:
-            a = self.accelerations[column.in_v]
-            bias = add(bias, scaled(a, column.linear))
-            spin_bias = add(spin_bias, scaled(a, column.angular))
-        self.bodies.append(
-            Body(
-                rotation,
-                origin,
-                add(parent.velocity, linear),
-                add(spin, angular),
-                add(parent.bias, bias),
-                add(parent.spin_bias, spin_bias),
-            )
-        )
+            angular = add(angular, scaled(self.v[i], about))
+            ahead = add(ahead, scaled(self.v[i], along))
+            bias = add(bias, scaled(self.accelerations[i], along))
+            spin_bias = add(spin_bias, scaled(self.accelerations[i], about))
+        spin = add(parent.spin, angular)
+        # A helical joint turns about the direction in which it moves.
+        turning = parent.spin if motion.kind == "helical" else spin
+        bias = add(bias, cross(add(parent.spin, turning), ahead))
+        spin_bias = add(spin_bias, cross(parent.spin, angular))
+        velocity = add(parent.velocity, linear)
+        gradient = gradient_of(spin, spin_bias)
+        self.bodies.append(Body(rotation, origin, velocity, spin, bias, spin_bias, gradient))
         self.columns.append(own)
 
     # -- inertia
@@ -318,9 +331,7 @@ class Trace:
         mass, x, y, z, *moments = self.take(motion.inertia)
         own = Moments(*moments)
         if not own.is_zero:
-            R = body.rotation
-            T = product(product(R, own.matrix), transposed(R))
-            own = Moments(T[0][0], T[0][1], T[0][2], T[1][1], T[1][2], T[2][2])
+            own = own.turned(body.rotation)
         return Inertia(mass, body.point((x, y, z)), own)
 
     def _force(self, body: Body, inertia: Inertia) -> tuple[Vector, Vector]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from srm_mbs.integration.generated.expressions import Expression
+from srm_mbs.integration.generated.expressions import CONSTANT, Expression
 
 Vector = tuple[Expression, Expression, Expression]
 Matrix = tuple[Vector, Vector, Vector]
@@ -87,6 +87,30 @@ class Moments(NamedTuple):
             (self.xx, self.xy, self.xz),
             (self.xy, self.yy, self.yz),
             (self.xz, self.yz, self.zz),
+        )
+
+    def turned(self, R: Matrix) -> Moments:
+        """R I R^T"""
+        aligned = self.xy.is_zero and self.xz.is_zero and self.yz.is_zero
+        if aligned and not any(entry.depends == CONSTANT for row in R for entry in row):
+            return self._turned_about_axes(R)
+        T = product(product(R, self.matrix), transposed(R))
+        return Moments(T[0][0], T[0][1], T[0][2], T[1][1], T[1][2], T[2][2])
+
+    def _turned_about_axes(self, R: Matrix) -> Moments:
+        """R I R^T = zz 1 + (xx - zz) x x^T + (yy - zz) y y^T, with columns x and y of R.
+
+        With the zeros of a rotation about one axis, moments about it need no sum, and round once.
+        """
+        x, y, _ = transposed(R)
+        a, b = scaled(self.xx - self.zz, x), scaled(self.yy - self.zz, y)
+        return Moments(
+            self.zz + (a[0] * x[0] + b[0] * y[0]),
+            a[0] * x[1] + b[0] * y[1],
+            a[0] * x[2] + b[0] * y[2],
+            self.zz + (a[1] * x[1] + b[1] * y[1]),
+            a[1] * x[2] + b[1] * y[2],
+            self.zz + (a[2] * x[2] + b[2] * y[2]),
         )
 
     def plus(self, other: Moments) -> Moments:

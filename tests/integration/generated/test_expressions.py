@@ -57,6 +57,7 @@ def test_of_a_sum_and_one_of_its_terms_the_other_is_left_without_rounding(
     assert (x + y) - y is x
     assert (x + y) - x is y
     assert (x - (x + y)) is -y
+    assert (x - y) - x is -y
     assert (x - x).is_zero
 
 

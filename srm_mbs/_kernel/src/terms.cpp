@@ -97,7 +97,6 @@ bool has_usual_joints(const Model& model) {
 }
 
 void compute_terms(Workspace& work) {
-    if (!work.axis_joints.empty()) return compute_axis_terms(work);
     const Model& model = work.model;
     Data& data = work.data;
     const Argument q(work.q), v(work.v);

@@ -14,8 +14,7 @@ bool has_usual_joints(const pinocchio::Model& model);
 // Pinocchio's crba (WORLD) and nonLinearEffects at q and v of the workspace in one pass: the same
 // statements, joint by joint; common terms (those of the joint, placements) are computed once.
 // Computes M, nle, J, oMi, v, a_gf as the two algorithms do; Ag refers to the origin of the world.
-// With other joints it calls the two algorithms.  Large trees of joints that turn about an axis
-// or slide along one have a pass of their own (axis_joints).
+// With other joints it calls the two algorithms.
 void compute_terms(Workspace& work);
 
 }  // namespace pinocchio_model

@@ -3,7 +3,6 @@
 
 #include <pinocchio/multibody.hpp>
 
-#include "axis_joints.hpp"
 #include "lean_data.hpp"
 #include "terms.hpp"
 
@@ -16,15 +15,12 @@ using Argument = Eigen::Ref<const Eigen::VectorXd>;
 struct Workspace {
     explicit Workspace(const pinocchio::Model& model)
         : model(model), q(model.nq), q2(model.nq), v(model.nv), tau(model.nv),
-          axis_joints(pinocchio_model::axis_joints(model)), axis_bodies(axis_joints.size()),
           one_pass(has_usual_joints(model)) {
         prepare(data, model);
     }
     const pinocchio::Model& model;
     pinocchio::Data data;
     Eigen::VectorXd q, q2, v, tau;
-    const std::vector<AxisJoint> axis_joints;
-    std::vector<AxisBody> axis_bodies;
     const bool one_pass;
 };
 

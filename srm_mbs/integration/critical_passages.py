@@ -738,14 +738,16 @@ class CriticalPassages:
         )
         if critical is None:
             return []
-        if self._one_freedom and not geometry.drives and critical.geometry is geometry:
-            self._found.append(critical)
         begin = geometry.at(analysis.split(state)[0], t)
         left, covered = (geometry.difference(critical.q, x) for x in (place, begin))
         self._known = bool(np.linalg.norm(left) < PASSED * np.linalg.norm(covered))
-        if abs(critical.residual) <= ROUNDED_RESIDUAL:
-            return []
         residual = critical.residual
+        if abs(residual) <= ROUNDED_RESIDUAL:
+            # Steps pass it in any turn.  A passage along a curve depends on where a search begins,
+            # and whether it ends: it has one of its own.
+            if self._one_freedom and not geometry.drives and critical.geometry is geometry:
+                self._found.append(critical)
+            return []
         avoided = abs(residual) > self._tolerance
         steps: list[tuple[StepResult, float]] = []
         disturbs = abs(residual) > DISTURBING * self._norm.rtol

@@ -107,19 +107,6 @@ def from_world(R: Sequence[Vector], a: Vector) -> Triple:
     return xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z
 
 
-def position_row(d: Vector, e: Vector, x: Vector, p: Vector, bias: Vector) -> Sequence[float]:
-    """A position row: its (force, moment) = (e, x x e), g = d . p, and Gdot v = d . bias."""
-    dx, dy, dz = d
-    ex, ey, ez = e
-    xx, xy, xz = x
-    px, py, pz = p
-    bx, by, bz = bias
-    return (
-        *(ex, ey, ez, xy * ez - xz * ey, xz * ex - xx * ez, xx * ey - xy * ex),
-        *(dx * px + dy * py + dz * pz, dx * bx + dy * by + dz * bz),
-    )
-
-
 class _JointTerm(NamedTuple):
     """c q of one joint in a joint row."""
 
@@ -399,7 +386,7 @@ class _LoopRows:
         p = minus(at_b, self._at_b)
         for d in self._d:
             e = d if ground else to_world(Rb, d)
-            out += position_row(d, e, x, p, bias)
+            out += *e, *cross3(x, e), dot(d, p), dot(d, bias)
         for length, factor in self._distances:
             apart = math.sqrt(dot(p, p))
             if apart < COINCIDENT * length:

@@ -37,9 +37,9 @@ ACCEPTED = 1e-11
 """Size of them from which the search has failed."""
 FROZEN = 1e-2
 """Newton step (units) from which on the Hessian is not evaluated again."""
-LED = 0.5
-"""Distance from a known critical configuration at which Newton's first step ends, over that of its
-start, below which the search leads there."""
+APPROACH = 0.5
+"""Distance from a known critical configuration after Newton's first step, over that before it,
+below which the search leads there."""
 RIDGE = 1e-5
 """Added to the Hessian, and taken from its counterpart for u: configurations that are critical
 together, such as those of a free base, and combinations that are, such as those of loops that are
@@ -216,7 +216,7 @@ def critical_configuration(
             continue
         H = one.searched * np.sign(weights @ one.weights)
         first, _ = _newton_step(g, G, u, delta, H)
-        if np.linalg.norm(first - away) < LED * np.linalg.norm(away):
+        if np.linalg.norm(first - away) < APPROACH * np.linalg.norm(away):
             turned = one.in_turns_of(q)
             if turned is not None:
                 return turned

@@ -11,6 +11,7 @@ from srm_mbs.integration.generated.expressions import write_c
 from srm_mbs.integration.generated.linearisation import linearisation_of
 from srm_mbs.integration.generated.structure import Structure
 from srm_mbs.integration.generated.terms import record_terms
+from srm_mbs.integration.generated.turns import TURNS
 
 ABI = 3
 """Version of the functions that the kernel calls: ``interface_version`` in generated.cpp."""
@@ -45,7 +46,10 @@ def source_of(structure: Structure) -> Source:
         *(structure.held, linear.constant_count),
     )
     text = _TEMPLATE.format(
-        sizes=", ".join(map(str, sizes)), constants=written.constants, terms=written.terms
+        turns=TURNS,
+        sizes=", ".join(map(str, sizes)),
+        constants=written.constants,
+        terms=written.terms,
     )
     text += _algebra(structure, [output.target for output in recorded.outputs]) + linear.text
     return Source(text, written.operations + linear.operations)
@@ -73,7 +77,7 @@ _TEMPLATE = """\
  * values, own: laws of elements and of coordinates; g, bias; G[row][column]; B, J: kinematics of
  * the bodies of bushings. */
 #include <math.h>
-
+{turns}
 const int srm_mbs_sizes[] = {{{sizes}}};
 
 void srm_mbs_constants(const double *restrict p, double *restrict k) {{

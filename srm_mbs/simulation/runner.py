@@ -876,7 +876,8 @@ class FinishedRun:
         if self.output is not None:
             return self.output.bifurcations
         failed = self._record.status is RunStatus.FAILED
-        return find_bifurcations(self._system, self.steps, self.dense, failed)  # type: ignore[arg-type]
+        steps = cast(StepData, self.steps)
+        return find_bifurcations(self._system, steps, lambda: cast(DenseOutput, self.dense), failed)
 
     @cached_property
     def message(self) -> str:

@@ -12,8 +12,8 @@ runs and long ones; with `--short` those of the slider-crank, with runs of 1 s; 
 serial sweep, to the last bit; of variants, Dask with processes is among them, after the others: its
 scheduler, in this process, and its workers take a tenth of two cores while they wait.  Workers have
 been started, and have run, before the clock is.  The repeats go through all executors in turn, and
-the best of each counts; `--seconds` is about what one takes serially.  CPU time over wall time, of this
-process, says on a busy machine whether threads run beside each other.
+the best of each counts; `--seconds` is about what one takes serially.  CPU time over wall time, of
+this process, says on a busy machine whether threads run beside each other.
 """
 
 from __future__ import annotations

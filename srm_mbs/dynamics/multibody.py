@@ -581,19 +581,6 @@ def _residual_scale(mechanism: Mechanism) -> FloatArray:
     return (structure.row_scale / unit)[structure.kept]
 
 
-@per_start
-def _singularities(mechanism: Mechanism) -> SingularityAnalysis:
-    structure = mechanism.structure
-    return SingularityAnalysis(
-        mechanism.q0,
-        structure.rank,
-        structure.sigma_ref,
-        structure.units.coordinate,
-        structure.units.rate,
-        partial(geometry_of, mechanism),
-    )
-
-
 class ClosedSystem(Mechanics):
     """A mechanism with closures.  Each Pinocchio algorithm is called once per evaluation."""
 
@@ -671,10 +658,19 @@ class ClosedSystem(Mechanics):
         super().restart()
         self.projection.factorisations = 0
 
-    @property
+    # Of the system, because it refers to the mechanism: kept there, each would keep the other.
+    @cached_property
     def singularities(self) -> SingularityAnalysis:
         """Data for the analysis of singular configurations."""
-        return _singularities(self.mechanism)
+        units = self.structure.units
+        return SingularityAnalysis(
+            self.mechanism.q0,
+            self.structure.rank,
+            self.structure.sigma_ref,
+            units.coordinate,
+            units.rate,
+            partial(geometry_of, self.mechanism),
+        )
 
     @property
     def branch_system(self) -> BranchSystem:

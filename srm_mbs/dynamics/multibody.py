@@ -640,13 +640,14 @@ class ClosedSystem(Mechanics):
 
     def constants_of_model(self) -> dict[str, Any]:
         """As for open mechanisms, and the rows of the closures."""
+        rows = rows_in_use(self.mechanism)  # of the reference the system has a workspace of its own
         own = {
-            "rows": len(self.loops.g),
+            "rows": len(rows.g),
             "structural_rank": self.structure.rank,
             "sigma_ref": self.structure.sigma_ref,
             "order": list(self._order),
         }
-        return super().constants_of_model() | self.loops.constants() | own
+        return super().constants_of_model() | rows.constants() | own
 
     def count(self, evaluations: int, factorisations: int) -> None:
         """Add the work of the compiled kernel for this system to the counters."""

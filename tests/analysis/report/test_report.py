@@ -473,8 +473,8 @@ def test_a_report_names_files_and_folders_only_if_asked(tmp_path: Path) -> None:
     urdf.write_text(urdf.read_text().replace("</link>", f"{visual}</link>"))
     solution = srm.simulate(srm.load(folder / "mine.toml"), 0.2)
 
-    solution.report(tmp_path / "a.html", again=False)
-    solution.report(tmp_path / "b.html", again=False, full_paths=True)
+    solution.report(tmp_path / "a.html", again=False, pictures=())
+    solution.report(tmp_path / "b.html", again=False, full_paths=True, pictures=())
     solution.save(tmp_path / "run.npz")
     run_command("report", tmp_path / "run.npz", "--no-second-run", "--out", tmp_path / "c.html")
 

@@ -328,7 +328,7 @@ def _turn_together(live: Sequence[Expression], names: _Names) -> tuple[list[str]
 def write_c(outputs: Sequence[Output], guards: Sequence[Guard] = ()) -> Written:
     """``outputs`` as C, in static single assignment, where all ``guards`` hold.
 
-    It calls ``turn_all`` of :mod:`srm_mbs.integration.generated.turns`.
+    It calls ``turn_all`` of :mod:`srm_mbs.integration.generated.source`.
     """
     roots = [node for guard in guards for node in guard] + [out.value for out in outputs]
     live = live_nodes(roots)

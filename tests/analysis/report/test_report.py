@@ -171,7 +171,7 @@ def test_the_certificate_in_the_page_is_that_of_the_run(
 def test_the_page_opens_from_disk_without_complaint_and_its_animation_plays(
     browser: Any, path: Path
 ) -> None:
-    with opened(browser, path.as_uri(), LARGE) as shown:
+    with opened(browser, path.as_uri(), LARGE, plays=True) as shown:
         inner = shown.frames[-1]
         assert inner.evaluate("animator.duration") == pytest.approx(4.0)
         before = inner.evaluate("animator.time")

@@ -1454,8 +1454,11 @@ void System::powers(const double* t, const double* states, std::size_t n,
     auto& w = *work_;
     std::vector<BushingStep> none;
     std::vector<std::vector<ForceElement>> each;
+    bool on_bodies = false;  // others depend on coordinates alone
     for (const ForceElement& element : elements) {
         check_indices(element, w.model);
+        on_bodies = on_bodies || element.kind == ForceKind::spring_damper ||
+                    element.kind == ForceKind::wrench || element.kind == ForceKind::bushing;
         each.push_back({element});
     }
     for (std::size_t i = 0; i < n; ++i, states += nq + nv) {
@@ -1463,8 +1466,10 @@ void System::powers(const double* t, const double* states, std::size_t n,
         std::copy(states, v, w.q.data());
         if (resting) w.v.setZero();
         else std::copy(v, v + nv, w.v.data());
-        pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
-        pinocchio::computeJointJacobians(w.model, w.data);
+        if (on_bodies) {
+            pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
+            pinocchio::computeJointJacobians(w.model, w.data);
+        }
         for (const std::vector<ForceElement>& one : each) {
             std::fill(f_.begin(), f_.end(), 0.0);
             add_forces(one, data_.coincident, w, t[i], states, w.v.data(), none, f_.data(), nullptr);

@@ -822,11 +822,12 @@ class CriticalPassages:
         system, scheme = self._system, self._scheme
         h = float(times[i + 1] - times[i])
         delta = system.difference(states[i], states[i + 1], h * rates[i])
-        # Rates between the ends only say how far the step leads.
-        first = float(scheme.b[0])
-        between = (delta / h - first * rates[i]) / (1.0 - first)
-        stages = np.tile(between, (scheme.n_stages + 1, 1))
-        stages[0], stages[-1] = rates[i], rates[i + 1]
+        stages = np.tile(rates[i], (scheme.n_stages + 1, 1))
+        if scheme.n_stages > 1:
+            # Rates between the ends only say how far the step leads.
+            first = float(scheme.b[0])
+            stages[1:] = (delta / h - first * rates[i]) / (1.0 - first)
+        stages[-1] = rates[i + 1]
         along = np.append(scheme.c, 1.0)
         return StepResult(
             t=float(times[i]),

@@ -248,6 +248,7 @@ def test_the_film_of_a_tutorial_moves_and_is_small(page: str) -> None:
     assert all(np.abs(b - a).max() > 50.0 for a, b in pairwise(frames))
 
 
+@pytest.mark.stress
 def test_the_site_has_the_animations_that_its_frames_show(tmp_path: Path) -> None:
     (tmp_path / "tutorials").mkdir()
     written = add_animations(tmp_path)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ import pinocchio as pin
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import EvaluationError, InputError
-from srm_mbs.model.mechanism import MechanismData, per_model
+from srm_mbs.model.mechanism import MechanismData, per_tree
 
 ROTATION_PER_STEP = 1.5
 """Rotation in one step (rad) that step-size control aims at; dexp^-1 is exact to round-off."""
@@ -144,12 +145,12 @@ def dexp_inverse(joint: GroupJoint, u: FloatArray, v: FloatArray) -> FloatArray:
     return out
 
 
-@per_model
+@per_tree
 def _groups(mechanism: MechanismData) -> tuple[GroupJoint, ...]:
     return group_joints(mechanism.model)
 
 
-@per_model
+@per_tree
 def _vector_coordinates(mechanism: MechanismData) -> IndexArray:
     """Index into q of each velocity component (nv,), -1 where q is not a vector space there."""
     index = np.full(mechanism.model.nv, -1)
@@ -159,11 +160,25 @@ def _vector_coordinates(mechanism: MechanismData) -> IndexArray:
     return index
 
 
-@per_model
+@per_tree
 def _angle_pairs(mechanism: MechanismData) -> IndexArray:
     """Velocity indices of the joints whose angle is (cos, sin)."""
     joints = mechanism.model.joints.tolist()[1:]
     return np.array([j.idx_v for j in joints if (j.nq, j.nv) == (2, 1)], dtype=int)
+
+
+@per_tree
+def _chart_constants(mechanism: MechanismData) -> dict[str, Any]:
+    groups = _groups(mechanism)
+    return {
+        "position_of": _vector_coordinates(mechanism).tolist(),
+        "groups": [(j.group, j.start, j.size, j.position) for j in groups],
+        "series": np.array(SERIES),
+        "turning": _angle_pairs(mechanism).tolist(),
+        "largest_rotation": LARGEST_ROTATION,
+        "farthest_node": FARTHEST_NODE,
+        "rotation_per_step": ROTATION_PER_STEP,
+    }
 
 
 class Manifold:
@@ -180,19 +195,15 @@ class Manifold:
         self.wraps = bool(len(_angle_pairs(mechanism)))
         self._unit = mechanism.structure.units.coordinate
         self._position_of = _vector_coordinates(mechanism)
-        self._largest_scale = np.concatenate([self._unit, np.full(self.nv, np.inf)])
+
+    @cached_property
+    def _largest_scale(self) -> FloatArray:
+        """Largest :meth:`state_scale` of coordinates that are a vector space."""
+        return np.concatenate([self._unit, np.full(self.nv, np.inf)])
 
     def chart_constants(self) -> dict[str, Any]:
         """Constants for the compiled kernel, independent of the start."""
-        return {
-            "position_of": [int(i) for i in self._position_of],
-            "groups": [(j.group, j.start, j.size, j.position) for j in self._groups],
-            "series": np.array(SERIES),
-            "turning": [int(i) for i in _angle_pairs(self.mechanism)],
-            "largest_rotation": LARGEST_ROTATION,
-            "farthest_node": FARTHEST_NODE,
-            "rotation_per_step": ROTATION_PER_STEP,
-        }
+        return _chart_constants(self.mechanism)
 
     def split(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Views (q, v) of a state."""

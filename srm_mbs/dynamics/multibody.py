@@ -34,9 +34,9 @@ from srm_mbs.dynamics.constraints.projection import (
     whiten,
 )
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
-from srm_mbs.dynamics.constraints.row_algebra import coordinate_parents, graph_order
+from srm_mbs.dynamics.constraints.row_algebra import graph_order
 from srm_mbs.dynamics.constraints.rows import COINCIDENT
-from srm_mbs.dynamics.constraints.structure import rows_in_use
+from srm_mbs.dynamics.constraints.structure import coordinate_tree, rows_in_use
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.forces import (
     HALF_TURN_ROUNDING,
@@ -216,6 +216,12 @@ class ClosedTerms:
             white = p.completed(white, self.predicted)
         rate = np.concatenate([self.v - position / eps, p.unwhiten(p.white_force - white)])
         return rate, p.unwhiten(white)
+
+
+@per_model
+def _constants(mechanism: Mechanism) -> dict[str, Any]:
+    """:meth:`Mechanics.constants_of_model`, once a system of the mechanism has filled it in."""
+    return {}
 
 
 class Mechanics(Manifold):
@@ -459,7 +465,10 @@ class Mechanics(Manifold):
     def constants(self) -> dict[str, Any]:
         """Everything that does not change, for the compiled kernel
         (:mod:`srm_mbs.integration.kernel`)."""
-        return _constants(self.mechanism) | self.constants_of_start()
+        known = _constants(self.mechanism)
+        if not known:
+            known |= self.constants_of_model()
+        return known | self.constants_of_start()
 
     def constants_of_start(self) -> dict[str, Any]:
         """Those among :meth:`constants` that depend on the start, or that the model may change."""
@@ -561,7 +570,7 @@ class OpenSystem(Mechanics):
 @per_model
 def _graph_order(mechanism: Mechanism) -> tuple[int, ...]:
     """The rows in use along the graph of the loops; () for few coordinates."""
-    return graph_order(rows_in_use(mechanism).pattern(), coordinate_parents(mechanism.model))
+    return graph_order(rows_in_use(mechanism).pattern(), coordinate_tree(mechanism)[0])
 
 
 @per_start
@@ -570,19 +579,6 @@ def _residual_scale(mechanism: Mechanism) -> FloatArray:
     structure = mechanism.structure
     unit = constraint_units(mechanism, structure.units)
     return (structure.row_scale / unit)[structure.kept]
-
-
-@per_start
-def _singularities(mechanism: Mechanism) -> SingularityAnalysis:
-    structure = mechanism.structure
-    return SingularityAnalysis(
-        mechanism.q0,
-        structure.rank,
-        structure.sigma_ref,
-        structure.units.coordinate,
-        structure.units.rate,
-        partial(geometry_of, mechanism),
-    )
 
 
 class ClosedSystem(Mechanics):
@@ -644,13 +640,14 @@ class ClosedSystem(Mechanics):
 
     def constants_of_model(self) -> dict[str, Any]:
         """As for open mechanisms, and the rows of the closures."""
+        rows = rows_in_use(self.mechanism)  # of the reference the system has a workspace of its own
         own = {
-            "rows": len(self.loops.g),
+            "rows": len(rows.g),
             "structural_rank": self.structure.rank,
             "sigma_ref": self.structure.sigma_ref,
             "order": list(self._order),
         }
-        return super().constants_of_model() | self.loops.constants() | own
+        return super().constants_of_model() | rows.constants() | own
 
     def count(self, evaluations: int, factorisations: int) -> None:
         """Add the work of the compiled kernel for this system to the counters."""
@@ -662,10 +659,19 @@ class ClosedSystem(Mechanics):
         super().restart()
         self.projection.factorisations = 0
 
-    @property
+    # Of the system, because it refers to the mechanism: kept there, each would keep the other.
+    @cached_property
     def singularities(self) -> SingularityAnalysis:
         """Data for the analysis of singular configurations."""
-        return _singularities(self.mechanism)
+        units = self.structure.units
+        return SingularityAnalysis(
+            self.mechanism.q0,
+            self.structure.rank,
+            self.structure.sigma_ref,
+            units.coordinate,
+            units.rate,
+            partial(geometry_of, self.mechanism),
+        )
 
     @property
     def branch_system(self) -> BranchSystem:
@@ -770,8 +776,3 @@ def make_system(
     if mechanism.structure.rank == 0:
         return OpenSystem(mechanism, controller)
     return ClosedSystem(mechanism, controller)
-
-
-@per_model
-def _constants(mechanism: Mechanism) -> dict[str, Any]:
-    return make_system(mechanism).constants_of_model()

@@ -17,7 +17,7 @@ Both are found after the run, on its dense output.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeVar
@@ -936,13 +936,15 @@ def _turns_back_there(monitor: ConstraintMonitor, steps: StepData, i: int) -> bo
 def find_bifurcations(
     system: System,
     steps: StepData,
-    dense: DenseOutput,
+    dense: Callable[[], DenseOutput],
     failed: bool,
 ) -> tuple[Bifurcation, ...]:
     """The singular configurations that a run reached without momentum, in order of time.
 
     Parameters
     ----------
+    dense
+        Makes the dense output, which most runs do not need for this.
     failed
         Whether the run could not continue from its last state.
     """
@@ -968,7 +970,7 @@ def find_bifurcations(
     if not (marked.any() or len(turning)):
         return ()
     found: list[Bifurcation] = []
-    monitor = ConstraintMonitor(analysis, dense)
+    monitor = ConstraintMonitor(analysis, dense())
     for i in turning.tolist():
         marked[i] = _turns_back_there(monitor, steps, i)
     for first, final in _ranges(np.flatnonzero(marked).tolist(), steps):

@@ -116,7 +116,7 @@ class RowSet:
         """Number of rows."""
         return len(self.labels)
 
-    @property
+    @cached_property
     def blocks(self) -> tuple[slice, slice, slice]:
         """The rows that are lengths (position and distance rows), alignments, and joint rows."""
         lengths = len(self.directions) + len(self.distances)

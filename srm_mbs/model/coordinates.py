@@ -120,8 +120,11 @@ def joint_coordinates(mechanism: MechanismData, names: Iterable[str]) -> IndexAr
 
 def free_coordinates(mechanism: MechanismData, held: Iterable[str]) -> IndexArray:
     """Velocity indices of the joints that are not held."""
+    names = set(held)
+    if not names:
+        return np.arange(mechanism.model.nv)
     free = np.ones(mechanism.model.nv, dtype=bool)
-    free[joint_coordinates(mechanism, set(held))] = False
+    free[joint_coordinates(mechanism, names)] = False
     return np.flatnonzero(free)
 
 

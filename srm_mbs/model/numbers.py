@@ -34,9 +34,7 @@ def finite_array(
         Whether it is a copy, which changes of ``values`` do not reach.
     """
     if type(values) is np.ndarray and values.dtype == float and values.shape == shape:
-        if not np.logical_and.reduce(np.isfinite(values), axis=None):
-            return None
-        return values.copy() if new else values
+        return (values.copy() if new else values) if _all_finite(values) else None
     try:
         given = np.asarray(values)
         if given.dtype.kind == "c":  # NumPy drops imaginary parts with no more than a warning
@@ -50,12 +48,14 @@ def finite_array(
     )
     if not fits:
         return None
+    return array if _all_finite(array) else None
+
+
+def _all_finite(array: FloatArray) -> bool:
     # Of a list where there are few, because a reduction of NumPy takes five times as long.
     if array.size <= FEW:
-        finite = all(map(math.isfinite, array.ravel().tolist()))
-    else:
-        finite = bool(np.logical_and.reduce(np.isfinite(array), axis=None))
-    return array if finite else None
+        return all(map(math.isfinite, array.ravel().tolist()))
+    return bool(np.logical_and.reduce(np.isfinite(array), axis=None))
 
 
 def vector_elements(vector: Any) -> list[Any]:

@@ -525,7 +525,7 @@ class SimulationResult(RunOutcome):
         if known is not None:
             return known
         failed = self.status is RunStatus.FAILED
-        return find_bifurcations(self._system, self.steps, self._dense, failed)
+        return find_bifurcations(self._system, self.steps, lambda: self._dense, failed)
 
     @cached_property
     def drift(self) -> FloatArray:

@@ -387,9 +387,14 @@ def _accepted_times(mechanism: Mechanism) -> set[float]:
     return set()
 
 
-def check_consistent(mechanism: Mechanism, t: float = 0.0, backend: str = "python") -> None:
+def check_consistent(
+    mechanism: Mechanism,
+    t: float = 0.0,
+    backend: str = "python",
+    system: OpenSystem | ClosedSystem | None = None,
+) -> None:
     """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates, which
-    ``backend`` evaluates.
+    ``backend`` evaluates; ``system`` is that of the mechanism, if it is at hand.
 
     Raises
     ------
@@ -398,18 +403,22 @@ def check_consistent(mechanism: Mechanism, t: float = 0.0, backend: str = "pytho
     """
     accepted = _accepted_times(mechanism)
     if t not in accepted:
-        _check_errors(mechanism, t, backend)
+        _check_errors(mechanism, t, backend, system)
         accepted.add(t)
 
 
-def _check_errors(mechanism: Mechanism, t: float, backend: str) -> None:
+def _check_errors(
+    mechanism: Mechanism, t: float, backend: str, system: OpenSystem | ClosedSystem | None
+) -> None:
     q0, v0 = mechanism.q0, mechanism.v0
+    start = np.array([t]), q0[None], v0[None]
     by_kernel = backend in COMPILED and not mechanism.drives
-    if t == 0.0 and not by_kernel:
+    if by_kernel:
+        g, c = (e[0] for e in closure_errors(mechanism, *start, system))
+    elif t == 0.0:
         g, c = mechanism.initial_errors
     else:
-        find = closure_errors if by_kernel else constraint_errors
-        g, c = (e[0] for e in find(mechanism, np.array([t]), q0[None], v0[None]))
+        g, c = (e[0] for e in constraint_errors(mechanism, *start))
     if not len(g):
         return
     units = mechanism.structure.units
@@ -466,7 +475,7 @@ def assemble_problem(
         system = make_system(mechanism, options.controller if held is None else held)
     mechanism.check_covers(t_end)
     if mechanism.constrained:
-        check_consistent(mechanism, t0, by)
+        check_consistent(mechanism, t0, by, system)
     watch = None
     if options.events is not None:
         nq = mechanism.model.nq
@@ -876,7 +885,8 @@ class FinishedRun:
         if self.output is not None:
             return self.output.bifurcations
         failed = self._record.status is RunStatus.FAILED
-        return find_bifurcations(self._system, self.steps, self.dense, failed)  # type: ignore[arg-type]
+        steps = cast(StepData, self.steps)
+        return find_bifurcations(self._system, steps, lambda: cast(DenseOutput, self.dense), failed)
 
     @cached_property
     def message(self) -> str:

@@ -248,6 +248,6 @@ class OutputStream:
         self._turned |= dict.fromkeys(over_half_turn(system.mechanism, q))
         self._least = np.minimum(self._least, q.min(axis=0))
         self._largest = np.maximum(self._largest, q.max(axis=0))
-        found = find_bifurcations(system, data, dense, failed and final)
+        found = find_bifurcations(system, data, lambda: dense, failed and final)
         self._bifurcations += [place for place in found if place.start > self._searched]
         self._searched = float(data.times[-1])

@@ -7,7 +7,7 @@ import math
 import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from pathlib import Path
 from queue import SimpleQueue
@@ -40,11 +40,12 @@ MAX_PENDING_CHUNKS = 512
 LEAST_PENDING_CHUNKS = 16
 """Chunks of adaptive length that are submitted at once, if there are so many: more than the workers
 of most executors, whose number no interface tells."""
-CHUNK_SECONDS = 0.05
-"""Time that a chunk of adaptive length is to take: sending one takes less than a hundredth of it,
-and a progress bar still moves."""
+CHUNK_SECONDS, SCHEDULED_CHUNK_SECONDS = 0.05, 0.5
+"""Time that a chunk of adaptive length is to take, with executors of the standard library and with
+others, whose schedulers, as that of Dask, spend 10 ms of CPU time on one: sending a chunk takes
+about a hundredth of it, and a progress bar still moves."""
 LONGEST_CHUNK = 2.0
-"""Time of such a chunk, over ``CHUNK_SECONDS``, after which a worker begins no further case."""
+"""Time of such a chunk, over the one it is to take, after which a worker begins no further case."""
 GROWTH = 4
 """Largest ratio of the lengths of such a chunk and of the one that it follows from: the first run
 of a worker takes longer than others."""
@@ -211,16 +212,18 @@ class _Waiting:
     cases
         All of them.
     chunk
-        Number of cases in each; None: as many as a worker runs in about ``CHUNK_SECONDS``, by the
-        last chunk that was finished, and fewer towards the end, so that workers end together.
+        Number of cases in each; None: as many as a worker runs in about ``seconds``, by the last
+        chunk that was finished, and fewer towards the end, so that workers end together.
+    seconds
+        Time that a chunk of adaptive length is to take.
     """
 
-    def __init__(self, cases: Sequence[Case], chunk: int | None) -> None:
+    def __init__(self, cases: Sequence[Case], chunk: int | None, seconds: float) -> None:
         self._cases = deque(cases)
-        self._chunk = chunk
+        self._chunk, self._seconds = chunk, seconds
         self._size = 1
         self._workers: set[tuple[str, int, int]] = set()
-        self.time_limit = math.inf if chunk is not None else LONGEST_CHUNK * CHUNK_SECONDS
+        self.time_limit = math.inf if chunk is not None else LONGEST_CHUNK * seconds
         """Seconds after which a worker returns what it has not begun."""
 
     @property
@@ -250,7 +253,7 @@ class _Waiting:
         """Take back what a worker has not begun, and choose the length of the next chunks."""
         self._workers.add(ran.worker)
         self._cases.extendleft(reversed(sent[len(ran.outcomes) :]))
-        fitting = int(CHUNK_SECONDS * len(ran.outcomes) / max(ran.seconds, SHORTEST_TIME))
+        fitting = int(self._seconds * len(ran.outcomes) / max(ran.seconds, SHORTEST_TIME))
         self._size = max(1, min(fitting, GROWTH * len(sent)))
 
 
@@ -263,7 +266,9 @@ def _finished(
             yield case, task.run(case.parameters)
         return
     sent = task if isinstance(executor, ThreadPoolExecutor) else packed(task)
-    waiting = _Waiting(cases, chunk)
+    standard = isinstance(executor, ThreadPoolExecutor | ProcessPoolExecutor)
+    seconds = CHUNK_SECONDS if standard else SCHEDULED_CHUNK_SECONDS
+    waiting = _Waiting(cases, chunk, seconds)
     running: dict[Future[Ran], list[Case]] = {}
     done: SimpleQueue[Future[Ran]] = SimpleQueue()
     try:

@@ -50,7 +50,7 @@ class Machine:
             top / name for name in ("checkout", "site", "neutral")
         )
         self.neutral.mkdir()
-        compiled = shutil.ignore_patterns("__pycache__", "_core*.so", "_core*.pyd", "built.py")
+        compiled = shutil.ignore_patterns("_core*.so", "_core*.pyd", "built.py")
         for name in ("srm_mbs", "models", "urdf", "benchmarks", "tests"):
             shutil.copytree(ROOT / name, self.checkout / name, ignore=compiled)
         for name in ("CMakeLists.txt", "pyproject.toml"):

@@ -55,9 +55,22 @@ def observed(
 
 @pytest.mark.parametrize(
     ("tableau", "m", "printed"),
-    [("trap", 1, 0.9722), ("trap", 2, 1.9995), ("tvd32", 2, 1.9646), ("tvd32", 3, 2.9999),
-     ("erk4", 1, 0.9344), ("erk4", 2, 1.8897), ("erk4", 3, 2.8783), ("erk4", 4, 3.9085)],
-)  # fmt: skip
+    [
+        ("trap", 1, 0.9722),
+        ("trap", 2, 1.9995),
+        ("tvd32", 3, 2.9999),
+        ("erk4", 3, 2.8783),
+        *(
+            pytest.param(*case, marks=pytest.mark.stress)
+            for case in (
+                ("tvd32", 2, 1.9646),
+                ("erk4", 1, 0.9344),
+                ("erk4", 2, 1.8897),
+                ("erk4", 4, 3.9085),
+            )
+        ),
+    ],
+)
 def test_srm_has_order_min_m_p_on_problem_one(tableau: str, m: int, printed: float) -> None:
     """Theory m; ``printed``: the thesis, tables 5.2 to 5.4, eps = h, over a wider range of h."""
     problem = problem_one(srm.TABLEAUS[tableau].order)
@@ -164,10 +177,18 @@ def test_sweeps_that_carry_by_pass_an_isolated_singularity(method: Any, bound: f
     ("method", "bounds"),
     [
         (srm.PSRM("tvd32", correction="sweep", T="inverse"), (2e-4, 2e-6)),
-        (srm.PSRM("dopr54", correction="sweep", T="inverse"), (2e-4, 2e-6)),
+        pytest.param(
+            srm.PSRM("dopr54", correction="sweep", T="inverse"),
+            (2e-4, 2e-6),
+            marks=pytest.mark.stress,
+        ),
         (srm.PSRM("dopr54", correction="sweep", T="inverse", interpolation="linear"), (1e-3, 2e-5)),
         (srm.PSRM("dop853", correction="fused", T="inverse"), (1e-6, 1e-8)),
-        (srm.SRM("tvd32", 3, T="inverse", restart=True, carry=True), (2e-4, 2e-6)),
+        pytest.param(
+            srm.SRM("tvd32", 3, T="inverse", restart=True, carry=True),
+            (2e-4, 2e-6),
+            marks=pytest.mark.stress,
+        ),
     ],
     ids=str,
 )
@@ -186,12 +207,23 @@ def test_adaptive_sweeps_pass_an_isolated_singularity_and_follow_the_tolerance(
 @pytest.mark.parametrize(
     ("method", "options", "bound"),
     [
-        (srm.SRM("tvd32", 3, T="inverse"), {"step": 0.02}, 1e-3),
+        pytest.param(
+            srm.SRM("tvd32", 3, T="inverse"), {"step": 0.02}, 1e-3, marks=pytest.mark.stress
+        ),
         (srm.SRM("tvd32", 3, T="inverse"), {"step": 0.01}, 2e-4),
-        (srm.SRM("erk4", 4, T="inverse"), {"step": 0.01}, 1e-4),
-        (srm.SRM("dopr54", 5, T="inverse"), {"step": 0.02}, 1e-3),
+        pytest.param(
+            srm.SRM("erk4", 4, T="inverse"), {"step": 0.01}, 1e-4, marks=pytest.mark.stress
+        ),
+        pytest.param(
+            srm.SRM("dopr54", 5, T="inverse"), {"step": 0.02}, 1e-3, marks=pytest.mark.stress
+        ),
         (srm.SRM("tvd32", 3, T="inverse"), {"rtol": 1e-4, "atol": 1e-4}, 1e-3),
-        (srm.SRM("tvd32", 3, T="inverse", eps=0.003), {"rtol": 1e-4, "atol": 1e-4}, 5e-5),
+        pytest.param(
+            srm.SRM("tvd32", 3, T="inverse", eps=0.003),
+            {"rtol": 1e-4, "atol": 1e-4},
+            5e-5,
+            marks=pytest.mark.stress,
+        ),
     ],
     ids=str,
 )

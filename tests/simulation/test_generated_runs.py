@@ -27,7 +27,16 @@ END = {"squeezing_mechanism": 0.03, "jansen_walker": 2.0, "klann_walker": 2.0}
 """Ends of runs (s); others last 3 s."""
 
 
-@pytest.mark.parametrize("name", DISTINCT_MODELS)
+LARGE = {"delta_robot", "stewart_platform"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.stress] if name in LARGE else [])
+        for name in DISTINCT_MODELS
+    ],
+)
 def test_runs_of_bundled_mechanisms_are_those_of_the_kernel(name: str) -> None:
     mechanism, t_end = load(name), END.get(name, 3.0)
     kernel, generated = (

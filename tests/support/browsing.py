@@ -18,8 +18,11 @@ SMALL, LARGE = (300, 200), (900, 600)
 
 
 @contextlib.contextmanager
-def opened(browser: Any, address: str, size: tuple[int, int] = SMALL) -> Iterator[Any]:
-    """The loaded page; whatever it complains about, or asks the network for, is an error."""
+def opened(
+    browser: Any, address: str, size: tuple[int, int] = SMALL, plays: bool = False
+) -> Iterator[Any]:
+    """The loaded page, which is stopped unless it ``plays``; whatever it complains about, or asks
+    the network for, is an error."""
     # Waiting for functions evaluates them in the page, which the policy of served pages forbids.
     viewport = {"width": size[0], "height": size[1]}
     context = browser.new_context(viewport=viewport, bypass_csp=True)
@@ -43,6 +46,8 @@ def opened(browser: Any, address: str, size: tuple[int, int] = SMALL) -> Iterato
     page.goto(address)
     # The last frame: the page itself, or one in it.
     page.frames[-1].wait_for_function("viewer.scene_tree.children.mechanism !== undefined")
+    if not plays:  # drawing a motion that nobody looks at would take a whole processor
+        page.frames[-1].evaluate("viewer.animator.pause()")
     yield page
     context.close()
     assert complaints == []

@@ -346,19 +346,19 @@ class CompiledAlgebra:
             raise EvaluationError("the closures are not finite") from None
 
 
-def row_algebra(pattern: BoolArray, model: pin.Model | None = None) -> RowAlgebra:
+def row_algebra(pattern: BoolArray, parents: Sequence[int] | None = None) -> RowAlgebra:
     """The algebra of rows with entries where ``pattern`` (rows, nv) is true: by the kernel, or by
     LAPACK without one or for at most ``KERNEL_ABOVE`` coordinates.
 
     Parameters
     ----------
-    model
-        The tree, if M is its mass matrix, and not 1.
+    parents
+        Those of the coordinates (:func:`coordinate_parents`), if M is a mass matrix, and not 1.
     """
     from srm_mbs._kernel import core
 
     rows, nv = pattern.shape
-    parents = [-1] * nv if model is None else coordinate_parents(model)
+    parents = [-1] * nv if parents is None else parents
     order = graph_order(pattern, parents)
     if core is None or nv <= KERNEL_ABOVE or not rows:
         return DenseAlgebra(order)

@@ -31,12 +31,17 @@ from srm_mbs.dynamics.constraints.projection import (
     whiten,
 )
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, unscaled_rows
-from srm_mbs.dynamics.constraints.row_algebra import RowAlgebra, row_algebra, trees
+from srm_mbs.dynamics.constraints.row_algebra import (
+    RowAlgebra,
+    coordinate_parents,
+    row_algebra,
+    trees,
+)
 from srm_mbs.dynamics.constraints.rows import Elimination, world_jacobian
 from srm_mbs.dynamics.scaling import Units, coordinate_units, row_units
 from srm_mbs.errors import EvaluationError, get_logger
 from srm_mbs.model.drives import in_order_of_rows
-from srm_mbs.model.mechanism import MechanismData, per_model, per_start
+from srm_mbs.model.mechanism import MechanismData, per_model, per_start, per_tree
 from srm_mbs.model.validation import check_inertia
 
 log = get_logger(__name__)
@@ -99,6 +104,13 @@ def random_steps(rng: np.random.Generator, steps: int, nv: int) -> RandomSteps:
     return RandomSteps(directions, reaches)
 
 
+@per_tree
+def coordinate_tree(mechanism: MechanismData) -> tuple[list[int], list[slice]]:
+    """The next coordinate to the root of each, and those of each tree that is rooted in the
+    ground."""
+    return coordinate_parents(mechanism.model), trees(mechanism.model)
+
+
 class ManifoldSampler:
     """Closes loops and walks on the closure manifold.
 
@@ -131,11 +143,11 @@ class ManifoldSampler:
         closures = [loop for loop in mechanism.loops for _ in loop.row_names]
         self._anchored = [row for row, loop in enumerate(closures) if not loop.rows.joint_rows]
         # All rows and those of the loops in the mass metric, those of the loops in units.
-        self._all = row_algebra(pattern, self.model)
+        parents, self._trees = coordinate_tree(mechanism)
+        self._all = row_algebra(pattern, parents)
         driven = self.closed < len(self.scale)
-        self._loops = row_algebra(pattern[: self.closed], self.model) if driven else self._all
+        self._loops = row_algebra(pattern[: self.closed], parents) if driven else self._all
         self._in_units = row_algebra(pattern[: self.closed])
-        self._trees = trees(self.model)
         self._factorised: FloatArray | None = None
 
     @cached_property

@@ -13,7 +13,7 @@ from srm_mbs._kernel.workspace import LARGE
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.reactions import Reactions, named_reactions
-from srm_mbs.dynamics.constraints.rheonomic import all_rows, constraint_errors
+from srm_mbs.dynamics.constraints.rheonomic import all_rows, constraint_errors, unscaled_rows
 from srm_mbs.dynamics.constraints.row_algebra import INERT, SingularValues, active_rows
 from srm_mbs.dynamics.forces import ForceKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
@@ -25,9 +25,10 @@ from srm_mbs.model.drives import in_order_of_rows
 from srm_mbs.model.mechanism import per_model
 
 
-def _make_all_rows(mechanism: Mechanism) -> Any:
+def _make_all_rows(system: ClosedSystem | OpenSystem) -> Any:
     """A kernel system with all rows of closures and drives, unscaled, and no algebra of them."""
-    rows = all_rows(mechanism)
+    mechanism = system.mechanism
+    rows = all_rows(mechanism) if mechanism.drives else unscaled_rows(mechanism)
     own = {
         "rows": len(rows.g),
         "structural_rank": 0,
@@ -36,7 +37,7 @@ def _make_all_rows(mechanism: Mechanism) -> Any:
         "gap_scale": np.ones(len(rows.g)),
         "drives": rows.drive_constants(),
     }
-    constants = make_system(mechanism).constants() | rows.constants() | own
+    constants = system.constants() | rows.constants() | own
     return core.System(mechanism.model, system_struct(constants), None)  # type: ignore[union-attr]
 
 
@@ -47,18 +48,24 @@ def _idle_all_rows(mechanism: Mechanism) -> deque[Any]:
 
 
 class _Lent:
-    """A kernel system of all rows, for one user."""
+    """A kernel system of all rows of a mechanism, for one user; made from ``system`` if there is
+    one."""
 
-    __slots__ = ("_idle", "_kernel_system", "_mechanism")
+    __slots__ = ("_idle", "_kernel_system", "_mechanism", "_system")
 
-    def __init__(self, idle: deque[Any], mechanism: Mechanism) -> None:
-        self._idle, self._mechanism = idle, mechanism
+    def __init__(
+        self,
+        idle: deque[Any],
+        mechanism: Mechanism,
+        system: ClosedSystem | OpenSystem | None,
+    ) -> None:
+        self._idle, self._mechanism, self._system = idle, mechanism, system
 
     def __enter__(self) -> Any:
         try:
             self._kernel_system = self._idle.pop()  # two threads never get the same
         except IndexError:
-            self._kernel_system = _make_all_rows(self._mechanism)
+            self._kernel_system = _make_all_rows(self._system or make_system(self._mechanism))
         return self._kernel_system
 
     def __exit__(self, *_: object) -> None:
@@ -66,12 +73,16 @@ class _Lent:
 
 
 def closure_errors(
-    mechanism: Mechanism, t: FloatArray, q: FloatArray, v: FloatArray
+    mechanism: Mechanism,
+    t: FloatArray,
+    q: FloatArray,
+    v: FloatArray,
+    system: ClosedSystem | OpenSystem | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """As :func:`~srm_mbs.dynamics.constraints.rheonomic.constraint_errors`, of a mechanism without
-    drives: their rows begin with its initial state."""
+    drives: their rows begin with its initial state; ``system`` is its own, if it is at hand."""
     try:
-        with _Lent(_idle_all_rows(mechanism), mechanism) as kernel_system:
+        with _Lent(_idle_all_rows(mechanism), mechanism, system) as kernel_system:
             return kernel_system.closure_errors(*_states(t, q, v))  # type: ignore[no-any-return]
     except ArithmeticError:
         return constraint_errors(mechanism, t, q, v)  # raises the error that says why
@@ -96,7 +107,7 @@ class CompiledObservables(Observables):
 
     def _all_rows(self) -> _Lent:
         """A kernel system of :func:`_make_all_rows` for one user."""
-        return _Lent(self.idle, self.mechanism)
+        return _Lent(self.idle, self.mechanism, self.system)
 
     @property
     def _calls_python(self) -> bool:
@@ -108,7 +119,7 @@ class CompiledObservables(Observables):
         self, t: FloatArray, q: FloatArray, v: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         if not self.mechanism.drives:
-            return closure_errors(self.mechanism, t, q, v)
+            return closure_errors(self.mechanism, t, q, v, self.system)
         try:
             with self._all_rows() as kernel_system:
                 return kernel_system.closure_errors(*_states(t, q, v))  # type: ignore[no-any-return]

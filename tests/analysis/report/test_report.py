@@ -171,7 +171,7 @@ def test_the_certificate_in_the_page_is_that_of_the_run(
 def test_the_page_opens_from_disk_without_complaint_and_its_animation_plays(
     browser: Any, path: Path
 ) -> None:
-    with opened(browser, path.as_uri(), LARGE) as shown:
+    with opened(browser, path.as_uri(), LARGE, plays=True) as shown:
         inner = shown.frames[-1]
         assert inner.evaluate("animator.duration") == pytest.approx(4.0)
         before = inner.evaluate("animator.time")
@@ -473,8 +473,8 @@ def test_a_report_names_files_and_folders_only_if_asked(tmp_path: Path) -> None:
     urdf.write_text(urdf.read_text().replace("</link>", f"{visual}</link>"))
     solution = srm.simulate(srm.load(folder / "mine.toml"), 0.2)
 
-    solution.report(tmp_path / "a.html", again=False)
-    solution.report(tmp_path / "b.html", again=False, full_paths=True)
+    solution.report(tmp_path / "a.html", again=False, pictures=())
+    solution.report(tmp_path / "b.html", again=False, full_paths=True, pictures=())
     solution.save(tmp_path / "run.npz")
     run_command("report", tmp_path / "run.npz", "--no-second-run", "--out", tmp_path / "c.html")
 

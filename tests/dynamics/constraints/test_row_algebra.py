@@ -69,7 +69,7 @@ def algebra_by(choice: str, pattern: np.ndarray, model: pin.Model | None = None)
     """The algebra of LAPACK or of the kernel, whatever the number of coordinates."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ranks, "KERNEL_ABOVE", 0 if choice == "kernel" else pattern.shape[1])
-        return row_algebra(pattern, model)
+        return row_algebra(pattern, None if model is None else coordinate_parents(model))
 
 
 def rows_of(n: int = 0) -> tuple[pin.Model, np.ndarray, np.ndarray]:
@@ -217,7 +217,7 @@ def test_the_factors_of_a_chain_grow_with_its_loops(angle: float) -> None:
         rows = LoopKinematics(model, loops, keep=np.tile([True, False, True], n))
         data = workspace(model)
         rows.evaluate(model, data, q)
-        algebra: Any = row_algebra(rows.pattern(), model)
+        algebra: Any = row_algebra(rows.pattern(), coordinate_parents(model))
         algebra.factor(data.M, rows.G)
         assert algebra.rank == 2 * n
         entries.append(algebra.entries)

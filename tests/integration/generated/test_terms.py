@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -17,6 +18,7 @@ from srm_mbs.integration.generated.code import load_code
 from srm_mbs.integration.generated.structure import UnsupportedElementError, structure_of
 from srm_mbs.integration.kernel import backend
 from srm_mbs.integration.kernel.system import make_kernel_system
+from srm_mbs.model.forces import ForceElement
 from tests.support.bundled import load
 from tests.support.dynamics import mass_matrix, nonlinear_effects
 from tests.support.generated import GeneratedFunction
@@ -67,8 +69,19 @@ JOINTS: dict[str, Callable[[], object]] = {
 }
 
 
-def _tree(make: Callable[[], object]) -> srm.Mechanism:
-    """A hinge, two joints of a kind after it, the second at an angle, and a second branch."""
+TREES = {
+    "revolute": ("RX", "RY", "RZ", "revolute"),
+    "unbounded": ("RUBX", "RUBY", "RUBZ", "unbounded"),
+    "prismatic": ("PX", "PY", "PZ", "prismatic"),
+    "helical": ("HX", "HY", "HZ", "helical"),
+    "of more coordinates": ("Spherical", "SphericalZYX", "Planar", "Translation"),
+    "free": ("FreeFlyer", "universal", "composite"),
+}
+"""Kinds of joints by tree: each tree costs a compilation."""
+
+
+def _tree(*kinds: Callable[[], object]) -> srm.Mechanism:
+    """A hinge, joints of these kinds at angles one after the other, a hinge; a second branch."""
     rng = np.random.default_rng(3)
     model = pin.Model()
 
@@ -84,7 +97,9 @@ def _tree(make: Callable[[], object]) -> srm.Mechanism:
         return index
 
     first = add(0, pin.JointModelRY(), "root")
-    last = add(add(first, make(), "one"), make(), "two")
+    last = first
+    for i, make in enumerate(kinds):
+        last = add(last, make(), f"joint {i}")
     add(last, pin.JointModelRZ(), "tip")
     add(first, pin.JointModelRX(), "branch")
     model.armature = rng.uniform(0.0, 0.1, model.nv)
@@ -103,9 +118,11 @@ def _states(mechanism: srm.Mechanism, count: int) -> list[tuple[FloatArray, Floa
     ]
 
 
-@pytest.mark.parametrize("name", JOINTS)
-def test_mass_matrix_and_nonlinear_effects_are_pinocchios_for_any_kind_of_joint(name: str) -> None:
-    mechanism = _tree(JOINTS[name])
+@pytest.mark.parametrize("names", TREES.values(), ids=TREES)
+def test_mass_matrix_and_nonlinear_effects_are_pinocchios_for_any_kind_of_joint(
+    names: tuple[str, ...],
+) -> None:
+    mechanism = _tree(*(JOINTS[name] for name in names))
     function, model = GeneratedFunction(mechanism), mechanism.model
     for q, v in _states(mechanism, 5):
         found = function(q, v)
@@ -115,6 +132,7 @@ def test_mass_matrix_and_nonlinear_effects_are_pinocchios_for_any_kind_of_joint(
         assert np.abs(found.nle - nle).max() < 2e-14 * np.abs(nle).max()
 
 
+LENGTH = 1.3
 CLOSURES = {
     "point": {},
     "frame": {},
@@ -125,37 +143,47 @@ CLOSURES = {
     "planar": {"axis": (0.0, 0.0, 1.0)},
     "point_on_line": {"axis": (0.0, 1.0, 0.0)},
     "point_on_plane": {"axis": (0.6, 0.0, 0.8)},
-    "distance": {"length": 1.3},
+    "distance": {"length": LENGTH},
 }
 
 
-def _ring(kind: str, ground: bool) -> srm.Mechanism:
-    """A chain of ball joints and a hinge whose end is tied to the ground or to its first body."""
+def _chain(length: int) -> pin.Model:
+    """Ball joints and a hinge, one after the other at angles."""
     rng = np.random.default_rng(5)
     model = pin.Model()
     joint = 0
-    for i in range(5):
+    for i in range(length):
         at = pin.SE3(pin.rpy.rpyToMatrix(rng.uniform(-1, 1, 3)), rng.uniform(-1, 1, 3))
         made = pin.JointModelRX() if i == 1 else pin.JointModelSpherical()
         joint = model.addJoint(joint, made, at, f"j{i}")
         model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
         model.addBodyFrame(f"body_{i}", joint, pin.SE3.Identity(), 0)
-    a = srm.Anchor("body_4", xyz=(0.3, 0.1, -0.2), rpy=(0.1, 0.2, 0.3))
-    at_b = {"xyz": (0.2, -0.1, 0.4), "rpy": (-0.4, 0.2, 0.9)}
-    b = srm.Anchor("world" if ground else "body_0", **at_b)
-    loop = srm.LoopClosure(kind, a, b, **CLOSURES[kind])
-    return srm.Mechanism(model, [loop], q0=pin.neutral(model))
+    return model
+
+
+def _closed(kinds: Iterable[str], ground: bool) -> srm.Mechanism:
+    """A chain whose end is tied to the ground or to its first body by closures of these kinds."""
+    model = _chain(3)
+    a = srm.Anchor("body_2", xyz=(0.3, 0.1, -0.2), rpy=(0.1, 0.2, 0.3))
+    b = srm.Anchor("world" if ground else "body_0", xyz=(0.2, -0.1, 0.4), rpy=(-0.4, 0.2, 0.9))
+    # All of them can be closed at once: a is at b then, and its distance is to a point beside b.
+    beside = replace(b, xyz=(b.xyz[0] + LENGTH, *b.xyz[1:]))
+    loops = [
+        srm.LoopClosure(kind, a, beside if kind == "distance" else b, name=kind, **CLOSURES[kind])
+        for kind in kinds
+    ]
+    return srm.Mechanism(model, loops, q0=pin.neutral(model))
 
 
 @pytest.mark.parametrize("ground", [pytest.param(True, marks=pytest.mark.stress), False])
-@pytest.mark.parametrize("kind", CLOSURES)
-def test_rows_of_closures_are_those_of_the_reference(kind: str, ground: bool) -> None:
-    mechanism = _ring(kind, ground)
+def test_rows_of_closures_are_those_of_the_reference(ground: bool) -> None:
+    mechanism = _closed(CLOSURES, ground)
     system, function = make_system(mechanism), GeneratedFunction(mechanism)
     for q, v in _states(mechanism, 5):
         system.evaluate(0.0, np.concatenate([q, v]))
         rows, found = system.loops, function(q, v)
-        for own, expected in ((found.g, rows.g), (found.G, rows.G), (found.bias, rows.bias)):
+        vectors = [(found.g, rows.g), (found.bias, rows.bias), *zip(found.G, rows.G)]
+        for own, expected in vectors:
             assert np.abs(own - expected).max() < 1e-13 * max(np.abs(expected).max(), 1.0)
 
 
@@ -201,21 +229,21 @@ def test_evaluations_of_bundled_mechanisms_are_those_of_the_kernel(name: str) ->
 
 FORCES = {
     "spring": srm.SpringDamper(
-        srm.Anchor("body_4", xyz=(0.1, 0.2, 0.3)),
+        srm.Anchor("body_2", xyz=(0.1, 0.2, 0.3)),
         srm.Anchor("body_0", xyz=(0.3, 0.0, 0.1)),
         stiffness=40.0,
         damping=3.0,
         rest_length=0.7,
     ),
     "spring without length": srm.SpringDamper(
-        srm.Anchor("body_4", xyz=(0.1, 0.2, 0.3)),
+        srm.Anchor("body_2", xyz=(0.1, 0.2, 0.3)),
         srm.Anchor("world"),
         stiffness=40.0,
         damping=3.0,
         rest_length=0.0,
     ),
     "rope": srm.SpringDamper(
-        srm.Anchor("body_4", xyz=(0.1, 0.2, 0.3)), srm.Anchor("world"), 40.0, 3.0, 0.0, slack=0.1
+        srm.Anchor("body_2", xyz=(0.1, 0.2, 0.3)), srm.Anchor("world"), 40.0, 3.0, 0.0, slack=0.1
     ),
     "friction and slack": srm.CouplingSpring(
         ("j1",), (0.8,), 30.0, 0.5, 0.1, slack=0.2, friction=2.0
@@ -224,16 +252,16 @@ FORCES = {
     "torque over time": srm.JointTorque("j1", 2.5, law=srm.Sine(1.0, frequency_hz=2.0)),
     "torsion": srm.TorsionSpring("j1", stiffness=4.0, damping=0.3, rest_angle=0.2),
     "limit": srm.LimitSpring("j1", lower=-0.3, upper=0.2, stiffness=50.0, damping=2.0, depth=0.4),
-    "wrench": srm.Wrench(srm.Anchor("body_3"), force=(1.0, 2.0, 3.0), moment=(0.0, -1.0, 2.0)),
+    "wrench": srm.Wrench(srm.Anchor("body_1"), force=(1.0, 2.0, 3.0), moment=(0.0, -1.0, 2.0)),
     "wrench of the link": srm.Wrench(
-        srm.Anchor("body_3", xyz=(0.1, 0.0, 0.0)),
+        srm.Anchor("body_1", xyz=(0.1, 0.0, 0.0)),
         force=(1.0, 2.0, 3.0),
         moment=(0.5, -1.0, 2.0),
         frame="link",
         law=srm.Polynomial((1.0, 0.5)),
     ),
     "bushing": srm.Bushing(
-        srm.Anchor("body_4", xyz=(0.1, 0.2, 0.3)),
+        srm.Anchor("body_2", xyz=(0.1, 0.2, 0.3)),
         srm.Anchor("body_0", rpy=(0.3, 0.0, 0.1)),
         stiffness=(10.0, 20.0, 30.0, 1.0, 2.0, 3.0),
         damping=(1.0, 2.0, 3.0, 0.1, 0.2, 0.3),
@@ -241,28 +269,24 @@ FORCES = {
 }
 
 
-RARE = ("rope", "torque over time")
-"""Each costs a compilation; others have the same parts of code."""
-
-
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.stress] if name in RARE else []) for name in FORCES],
-)
-def test_forces_of_elements_are_those_of_the_kernel(name: str) -> None:
-    plain = _ring("point_on_plane", True)
-    with_force = srm.Mechanism(plain.model, plain.loops, q0=plain.q0, forces=[FORCES[name]])
-    _agree(with_force)
-    without = make_kernel_system(make_system(plain), load_code(plain))
-    with_it = make_kernel_system(make_system(with_force), load_code(with_force))
+@pytest.mark.parametrize("names", [tuple(FORCES)[:6], tuple(FORCES)[6:]])
+def test_forces_of_elements_are_those_of_the_kernel(names: tuple[str, ...]) -> None:
+    plain = _closed(["point_on_plane"], True)
+    forces = [replace(FORCES[name], name=name) for name in names]
+    _agree(replace(plain, forces=forces))
     q, v = _states(plain, 1)[0]
     state = np.concatenate([q, v])
-    one, two = (system.terms(0.3, state)["rate"] for system in (without, with_it))
-    assert np.abs(one - two).max() > 1e-3
+
+    def rate(*own: ForceElement) -> FloatArray:
+        return make_kernel_system(make_system(replace(plain, forces=own))).terms(0.3, state)["rate"]
+
+    without = rate()
+    for name in names:
+        assert np.abs(rate(FORCES[name]) - without).max() > 1e-3, name
 
 
 def test_points_of_a_rod_that_coincide_are_refused_as_by_the_kernel() -> None:
-    plain = _ring("distance", True)
+    plain = _closed(["distance"], True)
     hinge = tuple(plain.model.jointPlacements[2].translation.tolist())
     spring = srm.SpringDamper(
         srm.Anchor("body_1"), srm.Anchor("body_0", xyz=hinge), stiffness=1.0, rest_length=1.0

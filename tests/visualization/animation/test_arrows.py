@@ -206,21 +206,6 @@ def test_forces_that_equilibrium_does_not_determine_are_grey_and_those_in_a_plan
     assert bricard.note()["more"].startswith("indeterminate")
 
 
-@pytest.mark.browser
-def test_the_page_of_the_walker_with_arrows_is_small_and_quick_to_draw(
-    browser: Any, tmp_path: Path
-) -> None:
-    walker = srm.simulate(load("jansen_walker"), 5.0)
-    with exported(browser, tmp_path, walker, arrows=True) as page:
-        drawn(page, 1.0)
-        calls, triangles = page.evaluate(
-            "[viewer.renderer.info.render.calls, viewer.renderer.info.render.triangles]"
-        )
-    assert 0 < calls < 300
-    assert 0 < triangles < 200_000
-    assert (tmp_path / "page.html").stat().st_size < 2_500_000
-
-
 def test_arrows_are_refused_where_no_forces_are_known() -> None:
     mechanism = load("four_bar")
     motion = srm.JointMotion(mechanism, np.array([0.0]), mechanism.q0[None])

@@ -630,7 +630,7 @@ def test_play_serves_a_page_that_repeats_the_motion_in_real_time(browser: Any) -
     solution = srm.simulate(bare("spatial_four_bar"), 2.0)
     visualizer = play(solution, fps=64.0, open_browser=False, block=False)
     try:
-        with opened(browser, visualizer.url()) as page:
+        with opened(browser, visualizer.url(), plays=True) as page:
             page.wait_for_function("viewer.animator.playing")
             assert page.evaluate("viewer.animator.duration") == pytest.approx(2.0, rel=1e-6)
             assert page.evaluate("viewer.animator.actions.every(a => a.repetitions === Infinity)")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import gc
 import pickle
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from typing import Any
@@ -172,3 +174,16 @@ def test_times_outside_the_run_are_refused_by_the_kernel_too() -> None:
         with pytest.raises(ValueError, match="the run covers"):
             solution(np.array([0.01, t]))
     assert np.isfinite(solution(0.02 * (1.0 + 1e-14))[0]).all()
+
+
+def test_a_mechanism_and_its_kernel_systems_are_freed_with_its_last_run() -> None:
+    mechanism = fresh()
+    freed = weakref.ref(mechanism)
+    gc.disable()  # which would free what refers to itself, but later
+    try:
+        solution = run(mechanism)
+        _ = solution.joint_reactions, solution.message
+        del mechanism, solution
+        assert freed() is None
+    finally:
+        gc.enable()

@@ -9,6 +9,31 @@
 
 namespace srm {
 
+namespace {
+
+// out = h sum_k a_k rates_k over the first `count` rates (n,).  Four components at a time stay in
+// registers over all rates; each is summed in the order of k.
+void combine(double h, const double* a, int count, const double* rates, int n, double* out) {
+    int i = 0;
+    for (; i + 4 <= n; i += 4) {
+        double s[4] = {0.0, 0.0, 0.0, 0.0};
+        for (int k = 0; k < count; ++k) {
+            if (a[k] == 0.0) continue;
+            const double by = h * a[k], *rate = rates + k * n + i;
+            for (int j = 0; j < 4; ++j) s[j] += by * rate[j];
+        }
+        std::copy_n(s, 4, out + i);
+    }
+    for (; i < n; ++i) {
+        double s = 0.0;
+        for (int k = 0; k < count; ++k)
+            if (a[k] != 0.0) s += h * a[k] * rates[k * n + i];
+        out[i] = s;
+    }
+}
+
+}  // namespace
+
 void ButcherTableau::check() const {
     const std::size_t s = b.size();
     if (s == 0) throw std::invalid_argument("b is empty");
@@ -484,9 +509,7 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
     for (int j = scheme.lead + 1; j <= s; ++j) {
         const bool end = j == s;
         const double* a = end ? scheme.b.data() : &scheme.A[j * s];
-        std::fill(delta_.begin(), delta_.end(), 0.0);
-        for (int k = 0; k < j; ++k)
-            if (a[k] != 0.0) add(h_ * a[k], &r.rates[k * n], delta_.data(), n);
+        combine(h_, a, j, r.rates.data(), n, delta_.data());
         if (j == s - 1) apart_ = delta_;
         if (end)
             for (int i = 0; i < n; ++i) apart_[i] = delta_[i] - apart_[i];
@@ -571,9 +594,7 @@ void SplitStep::estimate_error(const IntegratorState& memory, double sigma_chang
     r.error_ratio = 0.0;
     if (scheme.error.empty()) return;
     const int s = scheme.stages(), n = n_;
-    std::fill(error_.begin(), error_.end(), 0.0);
-    for (int k = 0; k <= s; ++k)
-        if (scheme.error[k] != 0.0) add(scheme.error[k], &r.rates[k * n], error_.data(), n);
+    combine(1.0, scheme.error.data(), s + 1, r.rates.data(), n, error_.data());
     for (int i = 0; i < n; ++i) {
         error_[i] = h_ * std::abs(error_[i]);
         weights_[i] = norm.weight(i, std::max(memory.state_scale[i], r.state_scale[i]));

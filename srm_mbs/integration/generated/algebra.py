@@ -74,6 +74,7 @@ def algebra_of(
     unrolled = nv <= LARGEST_UNROLLED
     entry = "U[{}][{}]" if unrolled else "AT(U[{}], {})"
     values = {
+        "LOOPS": _UNROLLED_LOOPS if unrolled else _LOOPS,
         "N": nv,
         "ROWS": rows,
         "RANK": rank,
@@ -118,6 +119,12 @@ typedef long long flags __attribute__((vector_size(8 * LANES)));
 enum { WIDE = (ROWS + LANES - 1) / LANES, HIGH = (N + LANES - 1) / LANES, SHORT = @SHORT@ };
 #define EACH(b, count) _Pragma("GCC unroll 16") for (int b = 0; b < count; ++b)
 #define UNROLL(i, first, count) _Pragma("GCC unroll 8") for (int i = first; i < count; ++i)
+/* k = 0, 1, ... and backwards, and the columns of U in its row k: loops that vanish if they are
+ * unrolled. */
+#define ALWAYS_INLINE inline __attribute__((always_inline))
+#define UP(k, count) _Pragma(UNROLLED) for (int k = 0; k < (count); ++k)
+#define DOWN(k, count) _Pragma(UNROLLED) for (int k = (count) - 1; k >= 0; --k)
+@LOOPS@
 #define AT(x, i) (((double *)(x))[i])
 #define AT_ROWS(w) ((long long *)(w)->rows)
 /* A squared norm is computed again below this part of that which was computed last. */
@@ -154,7 +161,7 @@ static inline void take_row(Factors *w, const double *G, int row) {
 }
 
 /* The column of the largest norm in the rows that are left, which is the next in `order`. */
-static inline __attribute__((always_inline)) int next_column(Factors *w, int k, vec *squares,
+static ALWAYS_INLINE int next_column(Factors *w, int k, vec *squares,
                                                              vec *limits, uint64_t active) {
   double *const square = (double *)squares, *const limit = (double *)limits, most = -1.0;
   int best = k;
@@ -283,6 +290,17 @@ _SPARSE = """\
   for IN(i, active) w->pivot_row[n++] = i;
 """
 
+_LOOPS = """\
+#define UNROLLED "GCC unroll 1"
+#define LATER(i, k) \\
+    for (int n_ = starts[k], i; n_ < starts[k + 1] && (i = later[n_], 1); ++n_)
+#define PIVOT_ROW(w, k) (w)->pivot_row[k]"""
+
+_UNROLLED_LOOPS = """\
+#define UNROLLED "GCC unroll 8"
+#define LATER(i, k) UNROLL(i, k + 1, N) if (reach[k] >> i & 1)
+#define PIVOT_ROW(w, k) (k)"""
+
 _UNROLLED = """\
   double U[N][N] = {{0}}, L[N][N], force[N];
 @MASS@
@@ -373,7 +391,7 @@ static inline double total(vec x) {
 
 static inline void reflect(const Factors *w, int k, double *restrict x) {
   const double *const V = (const double *)w->V[k];
-  const int count = w->count[k];
+  const int count = SHORT ? w->count[k] : N;
   if (count <= SHORT) {
     const unsigned char *const at = w->entry[k];
     double s = 0.0;
@@ -389,9 +407,9 @@ static inline void reflect(const Factors *w, int k, double *restrict x) {
 }
 
 /* x = Q x, two reflections at a time, whose products with x do not wait for each other. */
-static inline void times_q(const Factors *w, int rank, vec *restrict x) {
-  int k = rank;
-  for (; k > 1; k -= 2) {
+static ALWAYS_INLINE void times_q(const Factors *w, int rank, vec *restrict x) {
+  DOWN(n, rank / 2) {
+    const int k = (rank & 1) + 2 * n + 2;
     const vec *const a = w->V[k - 1], *const c = w->V[k - 2];
     if (SHORT && (w->count[k - 1] <= SHORT || w->count[k - 2] <= SHORT)) {
       reflect(w, k - 1, (double *)x);
@@ -408,7 +426,7 @@ static inline void times_q(const Factors *w, int rank, vec *restrict x) {
     const double t = w->tau[k - 2] * (total(second) - s * total(both));
     EACH(b, HIGH) x[b] -= s * a[b] + t * c[b];
   }
-  if (k) reflect(w, 0, (double *)x);
+  if (rank & 1) reflect(w, 0, (double *)x);
 }
 
 /* x = Q x or, transposed, x = Q^T x, with the first `rank` reflections. */
@@ -418,24 +436,31 @@ void srm_mbs_times_q(const void *work, int rank, int transposed, double *restric
   memcpy(x, white, N * sizeof *white);
   if (transposed)
     for (int k = 0; k < rank; ++k) reflect(w, k, (double *)x);
+  else if (rank == RANK)
+    times_q(w, RANK, x);
   else
     times_q(w, rank, x);
   memcpy(white, x, N * sizeof *white);
 }
 
-/* white = Q R^-T Pi^T g */
-void srm_mbs_normal(const void *work, int rank, const double *restrict g, double *restrict white) {
-  const Factors *const w = work;
+static ALWAYS_INLINE void normal(const Factors *w, int rank, const double *restrict g,
+                                 double *restrict white) {
   vec left[WIDE] = {{0}}, x[HIGH] = {{0}};
   memcpy(left, g, ROWS * sizeof *g);
-  for (int k = 0; k < rank; ++k) {
-    const int row = w->pivot_row[k];
+  UP(k, rank) {
+    const int row = PIVOT_ROW(w, k);
     const double y = AT(left, w->order[k]) * w->inverse_pivot[k];
     AT(x, row) = y;
     EACH(b, WIDE) left[b] -= y * w->X[row][b];
   }
   times_q(w, rank, x);
   memcpy(white, x, N * sizeof *white);
+}
+
+/* white = Q R^-T Pi^T g */
+void srm_mbs_normal(const void *work, int rank, const double *restrict g, double *restrict white) {
+  if (rank == RANK) normal(work, RANK, g, white);
+  else normal(work, rank, g, white);
 }
 
 /* g = Pi R^-1 Q^T white */
@@ -459,10 +484,10 @@ void srm_mbs_whiten_force(const void *work, double *restrict x) {
   const Factors *const w = work;
   double t[N];
   for (int k = 0; k < N; ++k) t[k] = x[N - 1 - k];
-  for (int k = 0; k < N; ++k) {
+  UP(k, N) {
     const double *const u = (const double *)w->U[k];
     const double value = x[k] = t[k] * w->inverse[k];
-    for (int n = starts[k]; n < starts[k + 1]; ++n) t[later[n]] -= u[later[n]] * value;
+    LATER(i, k) t[i] -= u[i] * value;
   }
 }
 
@@ -471,10 +496,10 @@ void srm_mbs_whiten_velocity(const void *work, double *restrict x) {
   const Factors *const w = work;
   double t[N];
   for (int k = 0; k < N; ++k) t[k] = x[N - 1 - k];
-  for (int k = 0; k < N; ++k) {
+  UP(k, N) {
     const double *const u = (const double *)w->U[k];
     double sum = u[k] * t[k];
-    for (int n = starts[k]; n < starts[k + 1]; ++n) sum += u[later[n]] * t[later[n]];
+    LATER(i, k) sum += u[i] * t[i];
     x[k] = sum;
   }
 }
@@ -483,10 +508,10 @@ void srm_mbs_whiten_velocity(const void *work, double *restrict x) {
 void srm_mbs_unwhiten(const void *work, double *restrict x) {
   const Factors *const w = work;
   double t[N];
-  for (int k = N; k-- > 0;) {
+  DOWN(k, N) {
     const double *const u = (const double *)w->U[k];
     double sum = x[k];
-    for (int n = starts[k]; n < starts[k + 1]; ++n) sum -= u[later[n]] * t[later[n]];
+    LATER(i, k) sum -= u[i] * t[i];
     t[k] = sum * w->inverse[k];
   }
   for (int k = 0; k < N; ++k) x[N - 1 - k] = t[k];

@@ -246,6 +246,8 @@ class Written(NamedTuple):
 
 
 _INFIX = frozenset("+-*/")
+TURNED_TOGETHER = 4
+"""Angles of which one call computes sines and cosines: lanes of a vector."""
 
 
 def live_nodes(roots: Iterable[Expression], done: set[int] | None = None) -> list[Expression]:
@@ -299,8 +301,35 @@ class _Names:
         return f"{node.operation}({', '.join(names)})"
 
 
+def _turn_together(live: Sequence[Expression], names: _Names) -> tuple[list[str], set[int]]:
+    """Statements with the sines and cosines of leaves, of several at a time, and their nodes."""
+    turning = [node for node in live if node.operation in ("sin", "cos")]
+    turning = [node for node in turning if node.operands[0].operation == "leaf"]
+    places = {
+        number: place for place, number in enumerate({n.operands[0].number: 0 for n in turning})
+    }
+    if len(places) < 2:
+        return [], set()
+    angles = ["0.0"] * (-(-len(places) // TURNED_TOGETHER) * TURNED_TOGETHER)
+    for node in turning:
+        place = places[node.operands[0].number]
+        angles[place] = node.operands[0].text
+        block, lane = divmod(place, TURNED_TOGETHER)
+        names.give(node, f"{node.operation}s{block}[{lane}]")
+    statements = []
+    for block in range(len(angles) // TURNED_TOGETHER):
+        first = block * TURNED_TOGETHER
+        given = ", ".join(angles[first : first + TURNED_TOGETHER])
+        statements.append(f"  angles sins{block}, coss{block};")
+        statements.append(f"  turn_all(&(angles){{{given}}}, &sins{block}, &coss{block});")
+    return statements, {node.number for node in turning}
+
+
 def write_c(outputs: Sequence[Output], guards: Sequence[Guard] = ()) -> Written:
-    """``outputs`` as C, in static single assignment, where all ``guards`` hold."""
+    """``outputs`` as C, in static single assignment, where all ``guards`` hold.
+
+    It calls ``turn_all`` of :mod:`srm_mbs.integration.generated.source`.
+    """
     roots = [node for guard in guards for node in guard] + [out.value for out in outputs]
     live = live_nodes(roots)
     read = [o for node in live if node.depends == VARIABLE for o in node.operands] + roots
@@ -320,8 +349,7 @@ def write_c(outputs: Sequence[Output], guards: Sequence[Guard] = ()) -> Written:
         elif node.operands:
             constants.append(f"  const double c{node.number} = {names.operation(node)};")
         names.give(node, node.text or f"c{node.number}" if place is None else f"k[{place}]")
-    terms: list[str] = []
-    done: set[int] = set()
+    terms, done = _turn_together(live, names)
     count = len(outputs)
 
     def evaluate(root: Expression) -> str:

@@ -297,7 +297,7 @@ def test_compile_says_how_it_was_made_and_cache_clears_it(folder: Path) -> None:
 def test_source_is_printed_and_not_compiled(folder: Path) -> None:
     source = run("compile", "four_bar", "--source")
     assert "int srm_mbs_terms(" in source
-    assert "sin(q[0])" in source
+    assert "turn_all(&(angles){q[0], q[1], q[2], 0.0}" in source
     assert not folder.exists()
 
 

@@ -204,6 +204,18 @@ def _agree(mechanism: srm.Mechanism, count: int = 8) -> None:
                 assert np.abs(a[key] - b[key]).max() <= max(allowed, 1e-12) * max(size, 1e-3), key
 
 
+@pytest.mark.parametrize("angle", [-1e3, 9e5, 1e7])
+def test_joints_that_turned_often_have_the_sines_of_the_kernel(angle: float) -> None:
+    """Also beyond the angles that are reduced by the generated code."""
+    mechanism = load("four_bar")
+    system = make_system(mechanism)
+    kernel, generated = make_kernel_system(system), make_kernel_system(system, load_code(mechanism))
+    state = np.concatenate([mechanism.q0 + angle * np.array([1.0, 0.0, -1.0]), mechanism.v0])
+    a, b = kernel.terms(0.0, state), generated.terms(0.0, state)
+    for key in ("rate", "correction", "sigma"):
+        assert np.abs(a[key] - b[key]).max() < 1e-12 * np.abs(a[key]).max(), key
+
+
 @pytest.mark.parametrize("loops", [19, pytest.param(32, marks=pytest.mark.stress)])
 def test_evaluations_of_many_loops_are_those_of_the_kernel(loops: int) -> None:
     """With generated algebra, and beyond its sizes with the kernel's."""

@@ -115,6 +115,14 @@ class Observables:
         rates = b[:, nq:] - a[:, nq:]
         return np.hstack([np.array(moved).reshape(len(a), model.nv), rates])
 
+    def moved(self, states: FloatArray, motions: FloatArray) -> FloatArray:
+        """Each of the states (n, nx) moved by one of the motions (n, 2 nv)."""
+        if states.shape[1] == motions.shape[1]:
+            out: FloatArray = states + motions
+            return out
+        pairs = zip(states, motions)
+        return np.array([self.system.retract(*pair) for pair in pairs]).reshape(states.shape)
+
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         """Kinetic and potential energy (n, 2) J: of the bodies; of gravity, springs and
         bushings."""

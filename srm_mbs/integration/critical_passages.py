@@ -18,12 +18,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.singularities.critical import (
+    LARGEST_DEVIATION,
     CriticalConfiguration,
     CurveThroughSaddle,
     critical_configuration,
@@ -86,8 +88,8 @@ PLACE_ROUNDING = 2e-15
 """Rounding (units^2) of a place on the curve, times its distance from the critical
 configuration."""
 EXTRAPOLATED = 1e-4
-"""|beta| (units) from which the distance of the curve from its hyperbola is known beyond
-rounding."""
+"""Distance (units) from the critical configuration from which that of the curve from its hyperbola
+is known beyond rounding."""
 CUT, CUT_FROM = 1.1, 0.9
 """Length of a panel in which the passage is to stop, over the one that is predicted to lead there,
 and the length, over that of the whole panel, below which it is cut so.  Interpolation to a time in
@@ -352,23 +354,21 @@ class PassageAlongCurve:
         self, beta: float, energy: float, mass: FloatArray
     ) -> tuple[FloatArray, FloatArray, float]:
         """Place, rates (n,) and beta' at ``beta``, with the kinetic ``energy`` (J) and the ``mass``
-        matrix (nv, nv): those of the hyperbola, moved by the distance of the last nodes from it."""
+        matrix (nv, nv): those of the hyperbola, moved by the distance of the last nodes from it,
+        which grows with the square of that from the critical configuration."""
         geometry = self.critical.geometry
         away, tangent = self._curve.hyperbola(beta)
         known = [
-            (node.beta, self._off_hyperbola(node))
+            (node.beta, self._off_hyperbola(node) / self._distance(node.beta) ** 2)
             for node, *_ in self._found[-2:]
-            if node.beta * beta > EXTRAPOLATED * abs(beta)
+            if self._distance(node.beta) ** 2 > EXTRAPOLATED * abs(beta)
         ]
-        if len(known) == 2:
-            (a, at_a), (b, at_b) = known
-            third = (at_b / b**2 - at_a / a**2) / (b - a)
-            second = at_b / b**2 - third * b
-            away = away + beta**2 * (second + beta * third)
-            tangent = tangent + beta * (2.0 * second + 3.0 * beta * third)
-        elif known:
-            b, at_b = known[0]
-            away, tangent = away + (beta / b) ** 2 * at_b, tangent + 2.0 * beta / b**2 * at_b
+        if known:
+            (a, at_a), (b, at_b) = known[0], known[-1]
+            slope = (at_b - at_a) / (b - a) if len(known) == 2 else np.zeros(len(away))
+            curvature, square = at_b + (beta - b) * slope, self._distance(beta) ** 2
+            away = away + square * curvature
+            tangent = tangent + 2.0 * beta * curvature + square * slope
         if self._driven:
             speed = float(1.0 / (tangent[-1] * geometry.unit[-1]))
         else:
@@ -532,6 +532,8 @@ class PassageAlongCurve:
                 )
         else:
             raise ValueError("the collocation does not converge")
+        for before, node in pairwise([self._found[-1][0], *nodes]):
+            self._check_neighbours(before, node)
         energy, t = energies[:-1], times[:-1]
         begin, energy_at_begin = self._clock, self._energy
         self._energy, self._clock = float(energies[-1]), float(times[-1])
@@ -598,7 +600,16 @@ class PassageAlongCurve:
             place, rates = node.place, speed * node.tangent
         else:
             raise ValueError("the end of the curve does not converge")
+        self._check_neighbours(self._found[-1][0], node)
         self._found.append((node, energy, t))
+
+    def _check_neighbours(self, before: Node, node: Node) -> None:
+        """Refuse a ``node`` to which the tangents there and at the one ``before`` do not lead:
+        closed configurations have other curves."""
+        moved = self.critical.geometry.difference(before.place, node.place)
+        led = 0.5 * (node.beta - before.beta) * (before.tangent + node.tangent)
+        if not np.linalg.norm(moved - led) < LARGEST_DEVIATION * np.linalg.norm(led):
+            raise ValueError("the configurations are on different curves")
 
 
 @dataclass(frozen=True)
@@ -811,11 +822,12 @@ class CriticalPassages:
         system, scheme = self._system, self._scheme
         h = float(times[i + 1] - times[i])
         delta = system.difference(states[i], states[i + 1], h * rates[i])
-        # Rates between the ends only say how far the step leads.
-        first = float(scheme.b[0])
-        between = (delta / h - first * rates[i]) / (1.0 - first)
-        stages = np.tile(between, (scheme.n_stages + 1, 1))
-        stages[0], stages[-1] = rates[i], rates[i + 1]
+        stages = np.tile(rates[i], (scheme.n_stages + 1, 1))
+        if scheme.n_stages > 1:
+            # Rates between the ends only say how far the step leads.
+            first = float(scheme.b[0])
+            stages[1:] = (delta / h - first * rates[i]) / (1.0 - first)
+        stages[-1] = rates[i + 1]
         along = np.append(scheme.c, 1.0)
         return StepResult(
             t=float(times[i]),

@@ -27,7 +27,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.observables import Observables
 from srm_mbs.dynamics.system import System, Zone
 from srm_mbs.errors import EvaluationError, InputError, safe_repr
@@ -96,14 +96,15 @@ def check_within(t: FloatArray, start: float, end: float) -> None:
         )
 
 
-def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> bool:
-    """Whether stages of the step (abscissae and sigma, (s + 1,)) lie close to a zero of sigma,
-    compared with its change, or so close that only nodes of the branch solve them."""
-    if not np.isfinite(sigmas).all():
-        return False
+def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> BoolArray:
+    """Whether stages of each step (abscissae (s + 1,) and sigma (..., s + 1)) lie close to a zero
+    of sigma, compared with its change, or so close that only nodes of the branch solve them."""
     later = abscissae > 0.0
-    change = float(np.max(np.abs(sigmas[later] - sigmas[0]) / abscissae[later]))
-    return bool(sigmas.min() < max(CLOSE_SIGMA * change, BRANCH_SIGMA))
+    with np.errstate(invalid="ignore"):  # infinite without closures
+        changes = np.abs(sigmas[..., later] - sigmas[..., :1]) / abscissae[later]
+    close = sigmas.min(axis=-1) < np.maximum(CLOSE_SIGMA * changes.max(axis=-1), BRANCH_SIGMA)
+    out: BoolArray = np.isfinite(sigmas).all(axis=-1) & close
+    return out
 
 
 def _whole(scheme: ButcherTableau, steps: StepData) -> FloatArray:
@@ -349,6 +350,15 @@ class StepData:
         critical = [step for one in self.critical_ranges for step in range(*one)]
         return sorted({*self.zones, *critical}) if critical else sorted(self.zones)
 
+    def with_stages(self, scheme: ButcherTableau) -> BoolArray:
+        """Which steps (n,) are explicit ones of ``scheme`` whose stages lie on the motion, to their
+        order: away from singular configurations."""
+        explicit = scheme.member(False)
+        out = np.full(self.count, explicit.implicit is None)
+        out &= (self.stiff == 0.0) & ~close_to_singular(explicit.abscissae, self.sigmas)
+        out[self.between_nodes] = False
+        return out
+
     @cached_property
     def layers(self) -> FloatArray:
         """Time and width (s) of the layer that a step belongs to (n, 2); width 0 without one.
@@ -570,7 +580,7 @@ class DenseOutput:
             return True
         return last - first > 1 and (
             step in data.zones
-            or close_to_singular(self._scheme_of(step).abscissae, data.sigmas[step])
+            or bool(close_to_singular(self._scheme_of(step).abscissae, data.sigmas[step]))
         )
 
     def _in_step(self, step: int, theta: FloatArray) -> FloatArray:

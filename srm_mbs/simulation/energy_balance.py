@@ -4,15 +4,20 @@ r"""Energy balance of a run: the energy gained is the work of controller, dampin
 
 with the works of the controller, of joint damping and friction, of each force element (of springs
 and bushings the damping only: their potential is part of V), and of each drive.  Closures, which do
-not depend on time, do no work.  Each power is integrated by Gauss quadrature on the dense output,
-step by step.
+not depend on time, do no work.  Each power is integrated step by step: where dampers do all the
+work, by the scheme of the run at its own stages,
+
+    W_{n+1} = W_n + h sum_i b_i P(x_i),
+
+as if W were a part of the state, so that the residual is that of the run; else, and where a step
+has no such stages, by Gauss quadrature on the dense output.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cached_property
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -23,6 +28,7 @@ from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.observables import LINEAR, Observables, working_elements
 from srm_mbs.errors import KnownKeys
 from srm_mbs.integration.dense_output import StepData
+from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.mechanism import per_model
 
 NODES = 8
@@ -98,6 +104,7 @@ class BalancedRun(Protocol):
     """The part of a :class:`~srm_mbs.simulation.result.SimulationResult` that a balance reads."""
 
     mechanism: Mechanism
+    scheme: ButcherTableau
 
     @property
     def t(self) -> FloatArray:
@@ -131,50 +138,136 @@ class BalancedRun(Protocol):
         """The run at other times."""
 
 
-_Nodes = Callable[[], BalancedRun]
-"""The run at the nodes of the quadrature: dense output costs more stages, so it is read only where
-something does work."""
+class Nodes:
+    """The nodes of the quadrature, in the intervals between ``ends`` (n + 1,) s, and the run there:
+    those at stages of the run, and after them those that dense output is read at.
+
+    They are looked for only where something does work, and read only where the power needs it.
+    """
+
+    def __init__(self, solution: BalancedRun, system: _System, ends: FloatArray) -> None:
+        self._run, self._ends, self._smooth = solution, ends, _smooth(system)
+        self.observables = solution.observables
+        self._scheme = solution.scheme.member(False)
+        self._stages = np.flatnonzero(self._scheme.b)
+
+    @cached_property
+    def _steps(self) -> IndexArray:
+        """Of each interval (n,) the step whose stages are its nodes; -1 where it is read."""
+        ends, steps = self._ends, self._run.steps
+        out = np.full(len(ends) - 1, -1)
+        if not (self._smooth and len(self._scheme.dense.extra_c) and steps.count):
+            return out
+        step = np.clip(np.searchsorted(steps.times, ends[:-1]), 0, steps.count - 1)
+        whole = (steps.times[step] == ends[:-1]) & (steps.times[step + 1] == ends[1:])
+        return np.where(whole & steps.with_stages(self._run.scheme)[step], step, out)
+
+    @cached_property
+    def _started(self) -> IndexArray:
+        """The steps (k,) whose stages are nodes."""
+        return self._steps[self._steps >= 0]
+
+    @cached_property
+    def _read_at(self) -> FloatArray:
+        """Times (k,) s that are read."""
+        read, (points, _) = self._steps < 0, self._gauss
+        starts, lengths = self._ends[:-1][read], np.diff(self._ends)[read]
+        return (starts[:, None] + np.outer(lengths, 0.5 * (points + 1.0))).ravel()
+
+    @property
+    def _gauss(self) -> tuple[FloatArray, FloatArray]:
+        return GAUSS[SMOOTH_NODES if self._smooth else NODES]
+
+    @cached_property
+    def run(self) -> BalancedRun:
+        """The run where it is read."""
+        return self._run.at(self._read_at)
+
+    @cached_property
+    def _motions(self) -> FloatArray:
+        """Motions (k, 2 nv) from the starts of steps to their stages."""
+        steps = self._run.steps
+        rates = steps.rates[self._started, : self._scheme.n_stages]
+        lengths = np.diff(steps.times)[self._started, None, None]
+        return (lengths * (self._scheme.A[self._stages] @ rates)).reshape(-1, rates.shape[2])
+
+    @cached_property
+    def _starts(self) -> FloatArray:
+        """States (k, nx) at the starts of the steps, for each of their stages."""
+        return np.repeat(self._run.steps.states[self._started], len(self._stages), axis=0)
+
+    @cached_property
+    def t(self) -> FloatArray:
+        """Times (k,) s."""
+        times, own = self._run.steps.times, self._started
+        inside = np.outer(np.diff(times)[own], self._scheme.c[self._stages])
+        return np.concatenate(((times[own, None] + inside).ravel(), self._read_at))
+
+    @cached_property
+    def q(self) -> FloatArray:
+        """Configurations (k, nq)."""
+        moved = self.observables.moved(self._starts, self._motions)
+        return self._joined(moved[:, : self._run.mechanism.model.nq], "q")
+
+    @cached_property
+    def v(self) -> FloatArray:
+        """Velocities (k, nv)."""
+        model = self._run.mechanism.model
+        return self._joined(self._starts[:, model.nq :] + self._motions[:, model.nv :], "v")
+
+    def _joined(self, stages: FloatArray, name: str) -> FloatArray:
+        return np.concatenate((stages, getattr(self.run, name))) if len(self._read_at) else stages
+
+    def work(self, power: FloatArray) -> FloatArray:
+        """Work (n,) J in each interval of the ``power`` (k,) W."""
+        at_stages, read = self._steps >= 0, self._steps < 0
+        count = len(self._started) * len(self._stages)
+        out = np.diff(self._ends)
+        out[at_stages] *= (
+            power[:count].reshape(-1, len(self._stages)) @ self._scheme.b[self._stages]
+        )
+        _, weights = self._gauss
+        out[read] *= power[count:].reshape(-1, len(weights)) @ (0.5 * weights)
+        return out
 
 
-def _controller(nodes: _Nodes, system: _System) -> Powers:
+def _controller(nodes: Nodes, system: _System) -> Powers:
     if not system.controlled:
         return {}
-    run = nodes()
-    states = zip(run.t, run.q, run.v)
+    states = zip(nodes.t, nodes.q, nodes.v)
     return {"controller": np.array([system.controlled_force(*x) @ x[2] for x in states])}
 
 
-def _joints(nodes: _Nodes, system: _System) -> Powers:
+def _joints(nodes: Nodes, system: _System) -> Powers:
     model = system.mechanism.model
     powers = {}
     if np.any(model.damping):
-        v = nodes().v
+        v = nodes.v
         powers["joint damping"] = (system.damping_force(v) * v).sum(axis=1)
     if np.any(model.friction):
-        v = nodes().v
+        v = nodes.v
         powers["joint friction"] = (system.friction_force(v) * v).sum(axis=1)
     return powers
 
 
-def _elements(nodes: _Nodes, system: _System) -> Powers:
+def _elements(nodes: Nodes, system: _System) -> Powers:
     """Power of force elements; of springs and bushings without their force at rest, which has a
     potential."""
     if not working_elements(system.mechanism):
         return {}
-    run = nodes()
-    powers = run.observables.powers(run.t, run.q, run.v)
+    powers = nodes.observables.powers(nodes.t, nodes.q, nodes.v)
     return {f"force {name}": power for name, power in powers.items()}
 
 
-def _drives(nodes: _Nodes, system: _System) -> Powers:
+def _drives(nodes: Nodes, system: _System) -> Powers:
     if not system.mechanism.drives:
         return {}
-    run = nodes()
+    run = nodes.run  # drives are not smooth: all nodes are read
     rates, forces = run.drive_rates, run.observables.drive_forces(run.t, run.q, run.v)
     return {f"drive {name}": force * rates[name] for name, force in forces.items()}
 
 
-TERMS: tuple[Callable[[_Nodes, _System], Powers], ...] = (
+TERMS: tuple[Callable[[Nodes, _System], Powers], ...] = (
     _controller,
     _joints,
     _elements,
@@ -203,16 +296,12 @@ def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
     ends = np.unique(np.concatenate([times[times < solution.steps.end], solution.t]))
     if times[0] < ends[0]:
         ends = np.concatenate([times[:1], ends])
-    points, weights = GAUSS[SMOOTH_NODES if _smooth(system) else NODES]
-    lengths = np.diff(ends)
-    nodes = ends[:-1, None] + 0.5 * (points + 1.0) * lengths[:, None]
-    at_nodes = cache(lambda: solution.at(nodes.ravel()))
+    nodes = Nodes(solution, system, ends)
     works = {}
     place = np.searchsorted(ends, solution.t)
     for term in TERMS:
-        for name, power in term(at_nodes, system).items():
-            pieces = 0.5 * lengths * (power.reshape(nodes.shape) @ weights)
-            works[name] = np.concatenate([[0.0], np.cumsum(pieces)])[place]
+        for name, power in term(nodes, system).items():
+            works[name] = np.concatenate([[0.0], np.cumsum(nodes.work(power))])[place]
     nq = solution.mechanism.model.nq
     first = solution.steps.states[:1]
     q = np.concatenate((first[:, :nq], solution.q))

@@ -255,3 +255,19 @@ def test_a_balance_without_works_reads_no_dense_output(monkeypatch: pytest.Monke
     monkeypatch.setattr(type(run), "at", lambda *_: pytest.fail("dense output was read"))
     assert run.energy_balance.works == {}
     assert run.energy_balance.relative < 1e-5
+
+
+def test_the_work_of_dampers_takes_the_stages_of_the_run_and_no_dense_output(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The reference is Gauss quadrature on the dense output, which output times inside each step
+    cause."""
+    run = srm.simulate(load("stewart_platform"), 0.5, rtol=1e-8)
+    halves = 0.5 * (run.t[1:] + run.t[:-1])
+    by_gauss = run.at(np.sort(np.concatenate([run.t, halves]))).energy_balance
+    monkeypatch.setattr(type(run), "at", lambda *_: pytest.fail("dense output was read"))
+    balance = run.energy_balance
+    assert list(balance.works) == [f"force spring_{i}" for i in range(1, 7)]
+    for name, work in balance.works.items():
+        assert np.abs(work - by_gauss.works[name][::2]).max() < 1e-10 * balance.scale
+    assert balance.relative < 1e-10

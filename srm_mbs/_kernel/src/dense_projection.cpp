@@ -3,6 +3,7 @@
 #include <cmath>
 #include <utility>
 
+#include "across_columns.hpp"
 #include "errors.hpp"
 #include "linear.hpp"
 
@@ -25,8 +26,13 @@ public:
           A_(nv * rows),
           tau_(rows),
           inverse_pivots_(rows),
-          squares_(rows),
-          order_(rows) {}
+          squares_(padded(rows)),
+          order_(rows) {
+        if (size) return;
+        T_.resize(static_cast<std::size_t>(nv) * (padded(nv + 1) + padded(rows)));
+        products_.resize(padded(rows));
+        first_squares_.resize(rows);
+    }
 
     double* column(int row) override {
         const int n = count();
@@ -64,25 +70,20 @@ public:
         times_q(white);
     }
 
-    void whiten_force(double* x) const override {
-        const int n = count();
-        for (int i = 0; i < n; ++i) x[i] = (x[i] - dot(&U_[i * n], x, i)) * inverse_[i];
-    }
+    void whiten_force(double* x) const override { size ? dots(x) : sums(x); }
+    void unwhiten(double* x) const override { size ? sums(x) : dots(x); }
 
     void whiten_velocity(double* x) const override {
         const int n = count();
+        if (size == 0) {
+            for (int i = n - 1; i >= 0; --i)
+                x[i] = U_[i * n + i] * x[i] + dot(&U_[i * n], x, i);
+            return;
+        }
         for (int i = 0; i < n; ++i) {
             const double value = U_[i * n + i] * x[i];
             add(x[i], &U_[i * n], x, i);
             x[i] = value;
-        }
-    }
-
-    void unwhiten(double* x) const override {
-        const int n = count();
-        for (int i = n - 1; i >= 0; --i) {
-            x[i] *= inverse_[i];
-            add(-x[i], &U_[i * n], x, i);
         }
     }
 
@@ -113,6 +114,19 @@ public:
 private:
     int count() const { return size ? size : nv; }
 
+    // x = U^-T x and x = U^-1 x; L^-1 x and L^-T x.
+    void dots(double* x) const {
+        const int n = count();
+        for (int i = 0; i < n; ++i) x[i] = (x[i] - dot(&U_[i * n], x, i)) * inverse_[i];
+    }
+    void sums(double* x) const {
+        const int n = count();
+        for (int i = n - 1; i >= 0; --i) {
+            x[i] *= inverse_[i];
+            add(-x[i], &U_[i * n], x, i);
+        }
+    }
+
     void keep_normal(double* white) const override {
         times_q_transposed(white);
         std::fill(white + rank, white + count(), 0.0);
@@ -121,13 +135,76 @@ private:
 
     void factorise(const double* M, const double* f, const double* bias, double) override {
         const int n = count();
-        std::copy(M, M + n * n, U_.begin());
-        std::copy(f, f + n, white_force.begin());
-        whiten_all();
-        for (int j = 0; j < rows; ++j)
-            gamma_[j] = dot(&A_[j * n], white_force.data(), n) + bias[j];
-        pivoted_qr();
+        if constexpr (size == 0) {
+            factorise_across_columns(M, f, bias);
+        } else {
+            std::copy(M, M + n * n, U_.begin());
+            std::copy(f, f + n, white_force.begin());
+            whiten_all();
+            for (int j = 0; j < rows; ++j)
+                gamma_[j] = dot(&A_[j * n], white_force.data(), n) + bias[j];
+            pivoted_qr();
+        }
         for (int k = 0; k < structural_rank; ++k) pivots_[k] = std::abs(A_[k * n + k]);
+    }
+
+    // The same for nv that is known at run time only.  Norms are updated as long as that loses no
+    // digits, as LAPACK does.
+    void factorise_across_columns(const double* M, const double* f, const double* bias) {
+        const int n = nv, first = padded(n + 1), width = first + padded(rows);
+        double* const T = T_.data();
+        double* const W = T + first;
+        for (int k = 0; k < n; ++k) {
+            for (int i = 0; i <= k; ++i)
+                T[k * width + n - 1 - i] = T[i * width + n - 1 - k] = M[k * n + i];
+            T[k * width + n] = f[k];
+            for (int j = 0; j < rows; ++j) W[k * width + j] = A_[j * n + k];
+        }
+        if (!factorise_rows(T, n, width, inverse_.data(), row_.data()))
+            throw EvaluationError{Failure::mass_matrix};
+        for (int k = 0; k < n; ++k) {
+            for (int i = 0; i <= k; ++i) U_[k * n + i] = T[k * width + n - 1 - i];
+            white_force[k] = T[k * width + n];
+        }
+        multiply_columns(W, width, n, padded(rows), white_force.data(), squares_.data(),
+                         products_.data());
+        for (int j = 0; j < rows; ++j) {
+            order_[j] = j;
+            row_squares_[j] = first_squares_[j] = squares_[j];
+            gamma_[j] = products_[j] + bias[j];
+        }
+        const int last = std::min(structural_rank, std::min(n, rows));
+        for (int k = 0; k < last; ++k) {
+            double* const column = &A_[k * n];
+            const int pivot = largest_column(k);
+            std::swap(order_[k], order_[pivot]);
+            for (int i = 0; i < n; ++i) {
+                double* const row = W + i * width;
+                column[i] = row[pivot];
+                row[pivot] = row[k];
+            }
+            squares_[pivot] = squares_[k];
+            first_squares_[pivot] = first_squares_[k];
+            make_reflection(k);
+            const int from = (k + 1) / lanes * lanes;
+            double* const row = W + k * width;
+            reflect_columns(row + from, width, n - k, padded(rows) - from, tau_[k], column + k);
+            for (int j = k + 1; j < rows; ++j) {
+                squares_[j] -= row[j] * row[j];
+                if (squares_[j] > norm_lost * first_squares_[j]) continue;
+                squares_[j] = 0.0;
+                for (int i = k + 1; i < n; ++i)
+                    squares_[j] += W[i * width + j] * W[i * width + j];
+                first_squares_[j] = squares_[j];
+            }
+        }
+    }
+
+    int largest_column(int k) const {
+        int pivot = k;
+        for (int j = k + 1; j < rows; ++j)
+            if (squares_[j] > squares_[pivot]) pivot = j;
+        return pivot;
     }
 
     // Cholesky factor U of M in U_, and L^-1 applied to the rows of G and the forces.  Row by row
@@ -170,9 +247,7 @@ private:
         }
         const int last = std::min(structural_rank, std::min(n, rows));
         for (int k = 0; k < last; ++k) {
-            int pivot = k;
-            for (int j = k + 1; j < rows; ++j)
-                if (squares_[j] > squares_[pivot]) pivot = j;
+            const int pivot = largest_column(k);
             if (pivot != k) {
                 std::swap_ranges(&A_[k * n], &A_[k * n] + n, &A_[pivot * n]);
                 std::swap(order_[k], order_[pivot]);
@@ -182,8 +257,8 @@ private:
         }
     }
 
-    // Reflects column k onto its first entry, and the columns after it.
-    void reflect(int k) {
+    // Makes the reflection of column k onto its entry k.
+    void make_reflection(int k) {
         const int n = count(), below = n - k - 1;
         double* const v = &A_[k * n] + k + 1;
         const double alpha = v[-1], tail = dot(v, v, below);
@@ -197,6 +272,13 @@ private:
             v[-1] = beta;
         }
         inverse_pivots_[k] = 1.0 / beta;
+    }
+
+    // Reflects the columns after column k, of which it makes the reflection.
+    void reflect(int k) {
+        make_reflection(k);
+        const int n = count(), below = n - k - 1;
+        const double* const v = &A_[k * n] + k + 1;
         for (int j = k + 1; j < rows; ++j) {
             double* const x = &A_[j * n] + k + 1;
             const double s = tau_[k] * (x[-1] + dot(v, x, below));
@@ -226,7 +308,12 @@ private:
         add(-s, v, x + k + 1, below);
     }
 
+    // U_: column i of U, M = U^T U, or row i of L, M = L^T L, which has no entries but those of a
+    // coordinate and its ancestors, for nv that is known at run time only.
     std::vector<double> U_, inverse_, row_, A_, tau_, inverse_pivots_, squares_;
+    // Of factorise_across_columns(): [M | f | G^T], padded, products of the columns with the
+    // forces, and their squared norms when these were last summed.
+    std::vector<double> T_, products_, first_squares_;
     std::vector<int> order_;
 };
 

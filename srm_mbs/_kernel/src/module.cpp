@@ -375,6 +375,18 @@ struct PySystem {
         return owned_array(std::move(out), {n, width});
     }
 
+    // Each of the states (n, nx) moved by one of the motions (n, 2 nv), in its own chart.
+    nb::object moved(const Array& states, const Array& motions) {
+        const std::size_t nx = state_size(), n = states.size() / nx;
+        const auto width = 2 * static_cast<std::size_t>(system->nv);
+        if (states.ndim() != 2 || states.shape(1) != nx || motions.size() != n * width)
+            throw nb::value_error("states or motions has another shape");
+        std::vector<double> out(n * nx);
+        for (std::size_t i = 0; i < n; ++i)
+            system->retract(states.data() + i * nx, motions.data() + i * width, &out[i * nx]);
+        return owned_array(std::move(out), {n, nx});
+    }
+
     // Kinetic and potential energy (n, 2).
     nb::object energies(const Array& states) {
         const std::size_t nx = state_size();
@@ -483,6 +495,7 @@ void bind_system(nb::module_& m) {
         .def("accelerations", &PySystem::accelerations, nb::arg("t"), nb::arg("states"))
         .def("smallest_values", &PySystem::smallest_values)
         .def("differences", &PySystem::differences, nb::arg("from"), nb::arg("to"))
+        .def("moved", &PySystem::moved, nb::arg("states"), nb::arg("motions"))
         .def("energies", &PySystem::energies)
         .def("powers", &PySystem::powers, nb::arg("t"), nb::arg("states"), nb::arg("elements"),
              nb::arg("resting"))

@@ -385,33 +385,29 @@ private:
     }
 
     // The node at beta before its first evaluation, and beta' there, with the kinetic energy (J):
-    // that of the hyperbola, moved by the distance of the last nodes from it.  The mass matrix is
-    // that of the evaluation made last.
+    // that of the hyperbola, moved by the distance of the last nodes from it, which grows with the
+    // square of that from the critical configuration.  The mass matrix is that of the evaluation
+    // made last.
     Node predicted(double beta, double energy, double& speed) {
-        Vector away(n_), tangent(n_), second, third;
+        Vector away(n_), tangent(n_);
         curve_.hyperbola(beta, away, tangent);
-        std::vector<const Node*> known;
+        std::vector<double> at;
+        std::vector<Vector> known;
         for (std::size_t k = found_.size() < 2 ? 0 : found_.size() - 2; k < found_.size(); ++k) {
             const Node& node = found_[k].node;
-            if (node.beta * node.beta > constants_.extrapolated * std::abs(beta))
-                known.push_back(&node);
+            const double square = squared_distance(node.beta);
+            if (!(square > constants_.extrapolated * std::abs(beta))) continue;
+            at.push_back(node.beta);
+            known.push_back(off_hyperbola(node));
+            for (double& value : known.back()) value /= square;
         }
-        if (!known.empty()) {
-            const double b = known.back()->beta;
-            second = off_hyperbola(*known.back());
-            for (double& value : second) value /= b * b;
-            third.assign(n_, 0.0);
-            if (known.size() == 2) {
-                const double a = known.front()->beta;
-                third = second;
-                add(-1.0 / (a * a), off_hyperbola(*known.front()).data(), third.data(), n_);
-                for (double& value : third) value /= b - a;
-                add(-b, third.data(), second.data(), n_);
-            }
-            for (int j = 0; j < n_; ++j) {
-                away[j] += beta * beta * (second[j] + beta * third[j]);
-                tangent[j] += beta * (2.0 * second[j] + 3.0 * beta * third[j]);
-            }
+        const double square = squared_distance(beta);
+        for (int j = 0; j < n_ && !at.empty(); ++j) {
+            const double last = known.back()[j], run = at.back() - at.front();
+            const double slope = at.size() == 2 ? (last - known.front()[j]) / run : 0.0;
+            const double curvature = last + (beta - at.back()) * slope;
+            away[j] += square * curvature;
+            tangent[j] += 2.0 * beta * curvature + square * slope;
         }
         Node out;
         out.beta = beta;
@@ -466,6 +462,19 @@ private:
 
     // Size of the displacement from the critical configuration at beta (units).
     double distance(double beta) const { return std::hypot(beta, curve_.width); }
+    double squared_distance(double beta) const { return distance(beta) * distance(beta); }
+
+    // Refuses a node to which the tangents there and at the one before do not lead: closed
+    // configurations have other curves.
+    void check_neighbours(const Node& before, const Node& node) {
+        Vector moved(n_), led(n_, 0.0);
+        closures_.difference(before.x, before.time, node.x, node.time, moved.data());
+        for (const Node* one : {&before, &node})
+            add(0.5 * (node.beta - before.beta), one->tangent.data(), led.data(), n_);
+        add(-1.0, led.data(), moved.data(), n_);
+        if (!(norm(moved.data(), n_) < constants_.largest_deviation * norm(led.data(), n_)))
+            throw NoPassage{};
+    }
 
     // Goes on along the panel from a to b, of xi times the heading, or only to a place behind the
     // end of the passage; returns where it led.
@@ -521,6 +530,8 @@ private:
             }
             if (done) break;
         }
+        for (int i = 0; i < count_; ++i)
+            check_neighbours(i ? nodes[i - 1] : found_.back().node, nodes[i]);
         const double begin = clock_, energy_before = energy_;
         energy_ = energies[count_];
         clock_ = times[count_];
@@ -599,6 +610,7 @@ private:
             if (solved(node, rate)) break;
             set_rates(node, rate);
         }
+        check_neighbours(found_.back().node, node);
         found_.push_back({std::move(node), energy, t});
     }
 

@@ -24,10 +24,12 @@ constexpr double packing = 0.5;
 // as much as gathered ones.
 constexpr int long_reflection = 8;
 constexpr double dense_part = 0.5;
-// Part of W's entries up to which the sparse algebra is chosen.  Measured on the bundled mechanisms
-// and random ones of 6 to 96 coordinates: below it the sparse algebra is faster; above it both cost
-// about the same, or the dense one, where a long chain fills W, is up to 1.8 times as fast.
-constexpr double densest = 0.5;
+// The sparse algebra is chosen above this number of coordinates, where at most this part of W's
+// entries differs from zero.  Measured with AVX2: for 21 to 25 coordinates in branched trees the
+// dense algebra is 1.4 times as fast, and for 40 with a third of the entries 1.5 times; in chains of
+// loops, which fill in least, both cost the same up to 33 coordinates, and the sparse one less above.
+constexpr int largest_dense = 32;
+constexpr double densest = 0.25;
 
 // The largest of numbers >= -1; four partial results, so that the compiler may use vector
 // registers.
@@ -62,6 +64,7 @@ std::vector<std::vector<int>> with_ancestors(const Pattern& pattern) {
 }
 
 bool sparse_pays(const Pattern& pattern) {
+    if (pattern.parents.size() <= largest_dense) return false;
     std::size_t entries = 0;
     for (const std::vector<int>& support : with_ancestors(pattern)) entries += support.size();
     return entries <= densest * pattern.parents.size() * pattern.supports.size();

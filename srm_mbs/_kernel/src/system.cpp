@@ -1454,21 +1454,39 @@ void System::powers(const double* t, const double* states, std::size_t n,
     auto& w = *work_;
     std::vector<BushingStep> none;
     std::vector<std::vector<ForceElement>> each;
+    const auto on_bodies = [](const ForceElement& e) {  // others depend on coordinates alone
+        return e.kind == ForceKind::spring_damper || e.kind == ForceKind::wrench ||
+               e.kind == ForceKind::bushing;
+    };
     for (const ForceElement& element : elements) {
         check_indices(element, w.model);
         each.push_back({element});
     }
+    const bool bodies = std::any_of(elements.begin(), elements.end(), on_bodies);
+    std::vector<double> wrenches(6 * w.model.njoints);
+    const auto power_on = [&](int joint) {
+        const pinocchio::Motion motion = w.data.oMi[joint].act(w.data.v[joint]);
+        return dot(&wrenches[6 * joint], motion.toVector().data(), 6);
+    };
     for (std::size_t i = 0; i < n; ++i, states += nq + nv) {
         const double* const v = states + nq;
         std::copy(states, v, w.q.data());
         if (resting) w.v.setZero();
         else std::copy(v, v + nv, w.v.data());
-        pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
-        pinocchio::computeJointJacobians(w.model, w.data);
+        if (bodies) pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
+        // Bodies that move tell the power of a wrench, which takes no Jacobian.
+        if (bodies && resting) pinocchio::computeJointJacobians(w.model, w.data);
         for (const std::vector<ForceElement>& one : each) {
+            const ForceElement& e = one.front();
+            const bool by_wrenches = !resting && on_bodies(e);
             std::fill(f_.begin(), f_.end(), 0.0);
-            add_forces(one, data_.coincident, w, t[i], states, w.v.data(), none, f_.data(), nullptr);
-            *out++ = dot(f_.data(), v, nv);
+            for (const int joint : {e.a.joint, e.b.joint})
+                if (by_wrenches) std::fill_n(&wrenches[6 * joint], 6, 0.0);
+            add_forces(one, data_.coincident, w, t[i], states, w.v.data(), none, f_.data(), nullptr,
+                       by_wrenches ? wrenches.data() : nullptr);
+            if (!by_wrenches) *out++ = dot(f_.data(), v, nv);
+            else *out++ = power_on(e.a.joint) +
+                          (e.a.joint == e.b.joint ? 0.0 : power_on(e.b.joint));
         }
     }
 }

@@ -168,6 +168,12 @@ class CompiledObservables(Observables):
         with self._all_rows() as kernel_system:
             return kernel_system.differences(a, b)  # type: ignore[no-any-return]
 
+    def moved(self, states: FloatArray, motions: FloatArray) -> FloatArray:
+        if states.shape[1] == motions.shape[1]:
+            return states + motions
+        with self._all_rows() as kernel_system:
+            return kernel_system.moved(states, motions)  # type: ignore[no-any-return]
+
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         with self._all_rows() as kernel_system:
             return kernel_system.energies(np.concatenate((q, v), axis=1))  # type: ignore[no-any-return]

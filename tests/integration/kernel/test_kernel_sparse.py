@@ -285,7 +285,7 @@ def test_an_evaluation_leaves_nothing_behind_for_the_next(n: int) -> None:
 def test_it_is_chosen_for_chains_of_loops_and_not_for_single_loops() -> None:
     for name, sparse in (("four_bar", False), ("spatial_four_bar", False), ("n_four_bar_2", False)):
         assert make_kernel_system(ClosedSystem(srm.load(name))).sparse is sparse
-    assert make_kernel_system(ClosedSystem(srm.n_four_bar(10))).sparse
+    assert make_kernel_system(ClosedSystem(srm.n_four_bar(20))).sparse
     system = ClosedSystem(srm.load("four_bar"))
     unknown = system.constants() | {"algebra": "banded"}
     with pytest.raises(ValueError, match="auto, dense or sparse"):

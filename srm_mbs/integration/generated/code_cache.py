@@ -39,12 +39,12 @@ except ImportError:  # Windows
 log = get_logger(__name__)
 
 # Products and sums are fused, which rounds once instead of twice; nothing else is allowed that
-# changes a result.  Thousands of statements without a branch have no partial redundancies to
-# eliminate; and GCC's register allocator, which takes half of the time there, need not weigh each
-# spill against hundreds of others.
+# changes a result.  Thousands of statements without a branch have few common subexpressions between
+# blocks; and GCC's register allocator, which takes half of the time there, need not weigh each
+# spill against hundreds of others.  Clang warns of what it does not know of these two.
 FLAGS = (
     *("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno"),
-    *("-fno-tree-pre", "-fno-gcse", "--param", "lra-max-considered-reload-pseudos=20"),
+    *("-fno-gcse", "--param", "lra-max-considered-reload-pseudos=20"),
 )
 LARGEST = 64 * 2**20
 """Bytes of the cache; the files used least recently go first."""

@@ -16,7 +16,7 @@ from srm_mbs.integration.generated import code, code_cache
 from srm_mbs.integration.kernel import backend
 from tests.support.bundled import finished, load
 from tests.support.commands import row, run
-from tests.support.mechanisms import DISTINCT_MODELS, distance, rod
+from tests.support.mechanisms import COMPILED_MODELS, distance, rod
 
 pytestmark = [
     pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}"),
@@ -27,16 +27,7 @@ END = {"squeezing_mechanism": 0.03, "jansen_walker": 2.0, "klann_walker": 2.0}
 """Ends of runs (s); others last 3 s."""
 
 
-LARGE = {"delta_robot", "stewart_platform"}
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=[pytest.mark.stress] if name in LARGE else [])
-        for name in DISTINCT_MODELS
-    ],
-)
+@pytest.mark.parametrize("name", COMPILED_MODELS)
 def test_runs_of_bundled_mechanisms_are_those_of_the_kernel(name: str) -> None:
     mechanism, t_end = load(name), END.get(name, 3.0)
     kernel, generated = (

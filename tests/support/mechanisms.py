@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pinocchio as pin
+import pytest
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
@@ -20,8 +21,15 @@ def _has_closures_and_no_drive(name: str) -> bool:
     return ("[[loop]]" in text or "[planar]" in text) and "drive]]" not in text
 
 
+LONG_TO_COMPILE = ("delta_robot", "stewart_platform")
+"""Bundled mechanisms whose code takes the compiler seconds."""
 DISTINCT_MODELS = tuple(name for name in srm.bundled_models() if not name.endswith("_planar"))
 """Without those that are others typed in as points and bars, to which a test compares them."""
+COMPILED_MODELS = [
+    pytest.param(name, marks=pytest.mark.stress) if name in LONG_TO_COMPILE else name
+    for name in DISTINCT_MODELS
+]
+"""The same, as parameters of tests that compile the code of each."""
 CLOSED_MODELS = tuple(filter(_has_closures_and_no_drive, DISTINCT_MODELS))
 """Those with closures alone; the rows of drives have tests of their own."""
 ANCHORED_MODELS = tuple(name for name in CLOSED_MODELS if name != "differential")

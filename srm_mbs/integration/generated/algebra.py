@@ -161,8 +161,8 @@ static inline void take_row(Factors *w, const double *G, int row) {
 }
 
 /* The column of the largest norm in the rows that are left, which is the next in `order`. */
-static ALWAYS_INLINE int next_column(Factors *w, int k, vec *squares,
-                                                             vec *limits, uint64_t active) {
+static ALWAYS_INLINE int next_column(Factors *w, int k, vec *squares, vec *limits,
+                                     uint64_t active) {
   double *const square = (double *)squares, *const limit = (double *)limits, most = -1.0;
   int best = k;
   for (int n = k; n < ROWS; ++n) {

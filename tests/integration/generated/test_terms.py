@@ -22,7 +22,7 @@ from srm_mbs.model.forces import ForceElement
 from tests.support.bundled import load
 from tests.support.dynamics import mass_matrix, nonlinear_effects
 from tests.support.generated import GeneratedFunction
-from tests.support.mechanisms import DISTINCT_MODELS, along_x, rod
+from tests.support.mechanisms import COMPILED_MODELS, along_x, rod
 
 pytestmark = [
     pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}"),
@@ -69,14 +69,14 @@ JOINTS: dict[str, Callable[[], object]] = {
 }
 
 
-TREES = {
-    "revolute": ("RX", "RY", "RZ", "revolute"),
-    "unbounded": ("RUBX", "RUBY", "RUBZ", "unbounded"),
-    "prismatic": ("PX", "PY", "PZ", "prismatic"),
-    "helical": ("HX", "HY", "HZ", "helical"),
-    "of more coordinates": ("Spherical", "SphericalZYX", "Planar", "Translation"),
-    "free": ("FreeFlyer", "universal", "composite"),
-}
+TREES = (
+    ("RX", "RY", "RZ", "revolute"),
+    ("RUBX", "RUBY", "RUBZ", "unbounded"),
+    ("PX", "PY", "PZ", "prismatic"),
+    ("HX", "HY", "HZ", "helical"),
+    ("Spherical", "SphericalZYX", "Planar", "Translation"),
+    ("FreeFlyer", "universal", "composite"),
+)
 """Kinds of joints by tree: each tree costs a compilation."""
 
 
@@ -118,7 +118,14 @@ def _states(mechanism: srm.Mechanism, count: int) -> list[tuple[FloatArray, Floa
     ]
 
 
-@pytest.mark.parametrize("names", TREES.values(), ids=TREES)
+@pytest.mark.parametrize(
+    "names",
+    [
+        *TREES,
+        *(pytest.param((name, name), marks=pytest.mark.stress) for name in JOINTS),
+    ],
+    ids=str,
+)
 def test_mass_matrix_and_nonlinear_effects_are_pinocchios_for_any_kind_of_joint(
     names: tuple[str, ...],
 ) -> None:
@@ -147,12 +154,12 @@ CLOSURES = {
 }
 
 
-def _chain(length: int) -> pin.Model:
-    """Ball joints and a hinge, one after the other at angles."""
+def _chain() -> pin.Model:
+    """Two ball joints and a hinge between them, at angles."""
     rng = np.random.default_rng(5)
     model = pin.Model()
     joint = 0
-    for i in range(length):
+    for i in range(3):
         at = pin.SE3(pin.rpy.rpyToMatrix(rng.uniform(-1, 1, 3)), rng.uniform(-1, 1, 3))
         made = pin.JointModelRX() if i == 1 else pin.JointModelSpherical()
         joint = model.addJoint(joint, made, at, f"j{i}")
@@ -163,7 +170,7 @@ def _chain(length: int) -> pin.Model:
 
 def _closed(kinds: Iterable[str], ground: bool) -> srm.Mechanism:
     """A chain whose end is tied to the ground or to its first body by closures of these kinds."""
-    model = _chain(3)
+    model = _chain()
     a = srm.Anchor("body_2", xyz=(0.3, 0.1, -0.2), rpy=(0.1, 0.2, 0.3))
     b = srm.Anchor("world" if ground else "body_0", xyz=(0.2, -0.1, 0.4), rpy=(-0.4, 0.2, 0.9))
     # All of them can be closed at once: a is at b then, and its distance is to a point beside b.
@@ -225,16 +232,7 @@ def test_evaluations_of_many_loops_are_those_of_the_kernel(loops: int) -> None:
     _agree(mechanism, count=2)
 
 
-LARGE = {"delta_robot", "stewart_platform"}
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=[pytest.mark.stress] if name in LARGE else [])
-        for name in DISTINCT_MODELS
-    ],
-)
+@pytest.mark.parametrize("name", COMPILED_MODELS)
 def test_evaluations_of_bundled_mechanisms_are_those_of_the_kernel(name: str) -> None:
     _agree(load(name))
 

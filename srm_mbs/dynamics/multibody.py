@@ -239,9 +239,9 @@ class Mechanics(Manifold):
         self._damping: FloatArray = self.model.damping.copy()
         self._friction: FloatArray = self.model.friction.copy()
         # Of a list, because any() of a short array costs five times as much.
-        self._is_damped = any(self._damping.tolist())
-        self._has_friction = any(self._friction.tolist())
-        self._is_loaded = self._is_damped or self._has_friction or controller is not None
+        self.is_damped = any(self._damping.tolist())
+        self.has_friction = any(self._friction.tolist())
+        self._is_loaded = self.is_damped or self.has_friction or controller is not None
         self.friction_speed = mechanism.friction_speed
         self._forces = resolved_forces(mechanism)
         self._first, self._last = -np.inf, np.inf
@@ -340,11 +340,11 @@ class Mechanics(Manifold):
 
     def damping_force(self, v: FloatArray) -> FloatArray:
         """Joint damping -d v, for the rates v (nv,) or (n, nv)."""
-        return -self._damping * v if self._is_damped else np.zeros(v.shape)
+        return -self._damping * v if self.is_damped else np.zeros(v.shape)
 
     def friction_force(self, v: FloatArray) -> FloatArray:
         """Joint friction -F tanh(v / v_s), for the rates v (nv,) or (n, nv)."""
-        if not self._has_friction:
+        if not self.has_friction:
             return np.zeros(v.shape)
         return -self._friction * np.tanh(v / self.friction_speed)
 
@@ -397,7 +397,7 @@ class Mechanics(Manifold):
         """Damping and friction, or what acts in place of the laws of the coordinates."""
         if self._applied is None:
             damping = self.damping_force(v)
-            return damping + self.friction_force(v) if self._has_friction else damping
+            return damping + self.friction_force(v) if self.has_friction else damping
         if self._joined is not None:
             return self._applied
         force = np.zeros(self.nv)
@@ -475,8 +475,8 @@ class Mechanics(Manifold):
         return {
             "unit": self._unit,
             "gap_scale": np.zeros(0),
-            "damping": self._damping if self._is_damped else None,
-            "friction": self._friction if self._has_friction else None,
+            "damping": self._damping if self.is_damped else None,
+            "friction": self._friction if self.has_friction else None,
         }
 
     def constants_of_model(self) -> dict[str, Any]:

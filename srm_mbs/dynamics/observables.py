@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
-from srm_mbs._typing import FloatArray
+from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.reactions import Reactions, reactions_at
 from srm_mbs.dynamics.constraints.rheonomic import all_rows, constraint_errors
@@ -178,6 +178,39 @@ class Observables:
         powers = self._powers(working_elements(self.mechanism), t, q, v)
         at_rest = self._powers(conservative_elements(self.mechanism), t, q, v, resting=True)
         return {name: power - at_rest.get(name, 0.0) for name, power in powers.items()}
+
+    def stage_powers(
+        self,
+        chosen: IndexArray,
+        times: FloatArray,
+        states: FloatArray,
+        rates: FloatArray,
+        A: FloatArray,
+        c: FloatArray,
+    ) -> dict[str, FloatArray]:
+        """Power (m, k) W of each force element but that of its potential, by name, at k stages of
+        the steps ``chosen`` (m,).
+
+        Parameters
+        ----------
+        times, states, rates
+            Ends (n + 1,) s of all steps, states (n + 1, nx) there and chart rates (n, s or more,
+            2 nv) at their stages.
+        A, c
+            Coefficients (k, s) and abscissae (k,) of the k stages.
+
+        Raises
+        ------
+        EvaluationError
+            If a force cannot be evaluated.
+        """
+        nq, h = self.mechanism.model.nq, np.diff(times)[chosen]
+        motions = h[:, None, None] * (A @ rates[chosen, : A.shape[1]])
+        starts = np.repeat(states[chosen], len(c), axis=0)
+        stages = self.moved(starts, motions.reshape(len(starts), -1))
+        t = times[chosen, None] + np.outer(h, c)
+        powers = self.powers(t.ravel(), stages[:, :nq], stages[:, nq:])
+        return {name: power.reshape(t.shape) for name, power in powers.items()}
 
     def _powers(
         self,

@@ -43,11 +43,9 @@ from srm_mbs.dynamics.singularities.local_analysis import (
 from srm_mbs.dynamics.system import SingularityAnalysis, System
 from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
 from srm_mbs.integration.dense_output import CRITICAL, STEP_PLACEMENTS, DenseOutput, StepData
-from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.butcher import SAME_STAGE, ButcherTableau
 from srm_mbs.model.mechanism import MechanismData, per_model
 
-SAME_STAGE = 1e-9
-"""Distance of two stages, over the step, below which they are at the same time."""
 SLOPE_MARGIN = 1.5
 """Largest change of sigma per time between two stages, over the largest that was recorded around
 them."""
@@ -440,11 +438,9 @@ def _recorded(scheme: ButcherTableau, steps: StepData) -> tuple[FloatArray, Floa
     """Times and sigmas of the stages in order of time, each time once."""
     h = np.diff(steps.times)
     if not np.logical_or.reduce(steps.stiff):  # stages in the same order in all steps
-        c = scheme.member(False).abscissae[1:]
-        along = np.argsort(c, kind="stable")
-        along = along[np.diff(c[along], prepend=0.0) > SAME_STAGE]
-        t = steps.times[:-1, None] + c[along] * h[:, None]
-        sigma = steps.sigmas[:, 1 + along]
+        own = scheme.member(False)
+        t = steps.times[:-1, None] + own.abscissae[own.distinct] * h[:, None]
+        sigma = steps.sigmas[:, own.distinct]
         return (
             np.concatenate([steps.times[:1], t.ravel()]),
             np.concatenate([steps.sigmas[0, :1], sigma.ravel()]),
@@ -459,6 +455,26 @@ def _recorded(scheme: ButcherTableau, steps: StepData) -> tuple[FloatArray, Floa
     step_of = np.concatenate([[0], step_of])
     fresh = np.concatenate([[True], np.diff(t) > SAME_STAGE * h[step_of[1:]]])
     return t[fresh], sigma[fresh]
+
+
+def _stays_away(scheme: ButcherTableau, steps: StepData) -> bool:
+    """Whether no interval between stages can be one of :func:`_may_vanish`: in each step the lowest
+    sigma, less the change that the steepest slope of the steps around allows in its longest
+    interval, bounds the lowest sigma of all.  Of one scheme only."""
+    if np.logical_or.reduce(steps.stiff):
+        return False
+    own, h = scheme.member(False), np.diff(steps.times)
+    sigma = np.empty((steps.count, len(own.distinct) + 1))
+    sigma[:, 1:] = steps.sigmas[:, own.distinct]
+    sigma[0, 0], sigma[1:, 0] = steps.sigmas[0, 0], sigma[:-1, -1]
+    lowest = np.minimum.reduce(sigma, axis=1)
+    if not np.minimum.reduce(lowest) >= LINGERING_SIGMA:
+        return False
+    lengths = np.diff(own.abscissae[own.distinct], prepend=0.0)
+    slopes = np.maximum.reduce(np.abs(np.diff(sigma, axis=1)) / lengths, axis=1) / h
+    reach = -(-scheme.n_stages // len(lengths))  # steps within n_stages samples
+    allowed = 0.5 * SLOPE_MARGIN * lengths.max() * h * _largest(slopes, reach, reach)
+    return bool(np.minimum.reduce(lowest - allowed) >= VANISHING_SIGMA * sigma.max())
 
 
 def _lowest(t: FloatArray, sigma: FloatArray, around: int) -> FloatArray:
@@ -669,15 +685,19 @@ def find_crossings(
     system: System,
     scheme: ButcherTableau,
     steps: StepData,
-    dense: DenseOutput,
-    tolerance: float = 0.0,
+    monitored: Callable[[], tuple[DenseOutput, float]],
 ) -> tuple[Crossing, ...]:
     """All crossings of a run, in order of time.
 
-    ``tolerance``: residual (row units) up to which a critical configuration counts as singular.
+    ``monitored`` returns its dense output, which runs that stay away from singular configurations
+    do not need, and the residual (row units) up to which a critical configuration counts as
+    singular.
     """
     analysis = system.singularities
     if analysis is None or not steps.count:
+        return ()
+    sharp = analysis.sigma_reference >= SMALL_REFERENCE_PIVOT
+    if sharp and not steps.critical_ranges and _stays_away(scheme, steps):
         return ()
     t, sigma = _recorded(scheme, steps)
     inside = t <= steps.end
@@ -685,8 +705,8 @@ def find_crossings(
     if len(t) < 3 or not np.isfinite(sigma).all():
         return ()
     monitor = None
-    if analysis.sigma_reference < SMALL_REFERENCE_PIVOT:
-        monitor = ConstraintMonitor(analysis, dense, tolerance)
+    if not sharp:
+        monitor = ConstraintMonitor(analysis, *monitored())
         sigma = monitor.smallest(t)
         sigma = sigma / np.median(sigma)
     lowest = _lowest(t, sigma, scheme.n_stages)
@@ -694,7 +714,7 @@ def find_crossings(
     dips, window_of = _dips(sigma, lowest, windows) if len(windows) else (windows, windows[:, 0])
     if not len(dips) and not steps.critical_ranges:
         return ()
-    monitor = monitor or ConstraintMonitor(analysis, dense, tolerance)
+    monitor = monitor or ConstraintMonitor(analysis, *monitored())
     examined = np.flatnonzero(np.bincount(window_of, minlength=len(windows)))
     tops = [
         begin + int(np.argmax(sigma[begin : end + 1])) for begin, end in windows[examined].tolist()

@@ -77,13 +77,13 @@ class EnergyBalance:
     start: float
     rounding: float
 
-    @property
+    @cached_property
     def residual(self) -> FloatArray:
         """Energy gained minus all works (n,) J: the error of the run, and of this balance."""
         done: FloatArray = sum(self.works.values(), start=np.zeros(len(self.t)))
         return self.kinetic + self.potential - self.start - done
 
-    @property
+    @cached_property
     def scale(self) -> float:
         """The energy (J) that took part: the largest of kinetic energy, change of potential energy
         and each work."""
@@ -146,7 +146,10 @@ class Nodes:
     """
 
     def __init__(self, solution: BalancedRun, system: _System, ends: FloatArray) -> None:
-        self._run, self._ends, self._smooth = solution, ends, _smooth(system)
+        self._run, self._ends = solution, ends
+        # Dampers do all the work, and no force has a kink.
+        acting = system.controlled or system.has_friction
+        self._smooth = not acting and _dampers_alone(system.mechanism)
         self.observables = solution.observables
         self._scheme = solution.scheme.member(False)
         self._stages = np.flatnonzero(self._scheme.b)
@@ -184,39 +187,30 @@ class Nodes:
         return self._run.at(self._read_at)
 
     @cached_property
-    def _motions(self) -> FloatArray:
-        """Motions (k, 2 nv) from the starts of steps to their stages."""
-        steps = self._run.steps
-        rates = steps.rates[self._started, : self._scheme.n_stages]
-        lengths = np.diff(steps.times)[self._started, None, None]
-        return (lengths * (self._scheme.A[self._stages] @ rates)).reshape(-1, rates.shape[2])
-
-    @cached_property
-    def _starts(self) -> FloatArray:
-        """States (k, nx) at the starts of the steps, for each of their stages."""
-        return np.repeat(self._run.steps.states[self._started], len(self._stages), axis=0)
-
-    @cached_property
-    def t(self) -> FloatArray:
-        """Times (k,) s."""
-        times, own = self._run.steps.times, self._started
-        inside = np.outer(np.diff(times)[own], self._scheme.c[self._stages])
-        return np.concatenate(((times[own, None] + inside).ravel(), self._read_at))
-
-    @cached_property
-    def q(self) -> FloatArray:
-        """Configurations (k, nq)."""
-        moved = self.observables.moved(self._starts, self._motions)
-        return self._joined(moved[:, : self._run.mechanism.model.nq], "q")
+    def _coefficients(self) -> FloatArray:
+        """Those (k, s) of the stages that are nodes."""
+        return np.ascontiguousarray(self._scheme.A[self._stages])
 
     @cached_property
     def v(self) -> FloatArray:
         """Velocities (k, nv)."""
-        model = self._run.mechanism.model
-        return self._joined(self._starts[:, model.nq :] + self._motions[:, model.nv :], "v")
+        steps, model, own = self._run.steps, self._run.mechanism.model, self._started
+        rates = steps.rates[own, : self._scheme.n_stages, model.nv :]
+        gained = np.diff(steps.times)[own, None, None] * (self._coefficients @ rates)
+        stages = (steps.states[own, None, model.nq :] + gained).reshape(-1, model.nv)
+        return np.concatenate((stages, self.run.v)) if len(self._read_at) else stages
 
-    def _joined(self, stages: FloatArray, name: str) -> FloatArray:
-        return np.concatenate((stages, getattr(self.run, name))) if len(self._read_at) else stages
+    def element_powers(self) -> Powers:
+        """Power (k,) of each force element but that of its potential."""
+        parts: list[Powers] = []
+        if len(self._started) or not len(self._read_at):
+            steps, c = self._run.steps, self._scheme.c[self._stages]
+            arrays = steps.times, steps.states, steps.rates, self._coefficients, c
+            parts.append(self.observables.stage_powers(self._started, *arrays))
+        if len(self._read_at):
+            run = self.run
+            parts.append(self.observables.powers(run.t, run.q, run.v))
+        return {name: np.concatenate([part[name].ravel() for part in parts]) for name in parts[0]}
 
     def work(self, power: FloatArray) -> FloatArray:
         """Work (n,) J in each interval of the ``power`` (k,) W."""
@@ -234,17 +228,16 @@ class Nodes:
 def _controller(nodes: Nodes, system: _System) -> Powers:
     if not system.controlled:
         return {}
-    states = zip(nodes.t, nodes.q, nodes.v)
+    states = zip(nodes.run.t, nodes.run.q, nodes.run.v)  # not smooth: all nodes are read
     return {"controller": np.array([system.controlled_force(*x) @ x[2] for x in states])}
 
 
 def _joints(nodes: Nodes, system: _System) -> Powers:
-    model = system.mechanism.model
     powers = {}
-    if np.any(model.damping):
+    if system.is_damped:
         v = nodes.v
         powers["joint damping"] = (system.damping_force(v) * v).sum(axis=1)
-    if np.any(model.friction):
+    if system.has_friction:
         v = nodes.v
         powers["joint friction"] = (system.friction_force(v) * v).sum(axis=1)
     return powers
@@ -255,8 +248,7 @@ def _elements(nodes: Nodes, system: _System) -> Powers:
     potential."""
     if not working_elements(system.mechanism):
         return {}
-    powers = nodes.observables.powers(nodes.t, nodes.q, nodes.v)
-    return {f"force {name}": power for name, power in powers.items()}
+    return {f"force {name}": power for name, power in nodes.element_powers().items()}
 
 
 def _drives(nodes: Nodes, system: _System) -> Powers:
@@ -276,10 +268,10 @@ TERMS: tuple[Callable[[Nodes, _System], Powers], ...] = (
 """Everything that does work beside the potentials; what is new is added here."""
 
 
-def _smooth(system: _System) -> bool:
-    """Whether dampers do all the work, and no force has a kink."""
-    mechanism = system.mechanism
-    return not (system.controlled or mechanism.drives or np.any(mechanism.model.friction)) and all(
+@per_model
+def _dampers_alone(mechanism: Mechanism) -> bool:
+    """Whether all force elements are springs and dampers without a kink, and no drive moves it."""
+    return not mechanism.drives and all(
         isinstance(force, LINEAR) and not getattr(force, "slack", 0.0) for force in mechanism.forces
     )
 

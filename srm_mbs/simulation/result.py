@@ -466,23 +466,17 @@ class SimulationResult(RunOutcome):
         run.observables = self.observables  # and their workspace
         return run
 
-    def between_ends(self, t: FloatArray, allowed: FloatArray) -> Self:
-        """The run read at the times ``t`` (k,) s, ascending, as by :meth:`at`, but to within
-        ``allowed`` (2 nv,) only: most states then need no evaluation."""
-        run = type(self)(
-            self.mechanism,
-            self._system,
-            self.scheme,
-            self._whole,
-            t_eval=None,
-            events=self._events,
-            status=self.status,
-        )
-        run.t_eval = np.clip(t, self.steps.times[0], self.steps.end)
-        run._nodes = run.t_eval, self._dense.between_ends(run.t_eval, allowed)
-        run.request, run.error = self.request, self.error
-        run.observables = self.observables  # and their workspace
-        return run
+    def states(self, t: FloatArray, allowed: FloatArray | None = None) -> FloatArray:
+        """States (k, nq + nv) at the times ``t`` (k,) s; with ``allowed`` (2 nv,) those of
+        ascending times to within that only: most then need no evaluation."""
+        dense = self._dense
+        return dense(t) if allowed is None else dense.between_ends(t, allowed)
+
+    def unwrapped(self, name: str, t: FloatArray, states: FloatArray) -> FloatArray:
+        """Angle (k,) rad of a joint that is stored as cosine and sine, with the ``states``
+        (k, nq + nv) at the times ``t`` (k,) s."""
+        joint, nq = self.mechanism.joint(name), self.mechanism.model.nq
+        return unwrapped_angles(joint, nq, self.steps, self.scheme, t, states)
 
     @property
     def segments(self) -> tuple[SimulationResult, ...]:
@@ -508,15 +502,16 @@ class SimulationResult(RunOutcome):
             return self.q[:, joint.idx_q], rate
         if self._run.output is not None:
             return self._run.output.angles[self.mechanism.model.getJointId(name)], rate
-        states = np.hstack([self.q, self.v])
-        nq = self.mechanism.model.nq
-        return unwrapped_angles(joint, nq, self.steps, self.scheme, self.t, states), rate
+        return self.unwrapped(name, self.t, np.hstack([self.q, self.v])), rate
 
     @cached_property
     def crossings(self) -> tuple[Crossing, ...]:
         """Passages through singular configurations, in order of time."""
-        tolerance = self.settings.singular_tolerance
-        return find_crossings(self._system, self.scheme, self.steps, self._dense, tolerance)
+
+        def monitored() -> tuple[DenseOutput, float]:
+            return self._dense, self.settings.singular_tolerance
+
+        return find_crossings(self._system, self.scheme, self.steps, monitored)
 
     @cached_property
     def bifurcations(self) -> tuple[Bifurcation, ...]:

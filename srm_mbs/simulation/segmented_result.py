@@ -136,9 +136,14 @@ class SegmentedResult(SimulationResult):
         run.request, run.error = self.request, self.error
         return run
 
-    def between_ends(self, t: FloatArray, allowed: FloatArray) -> Self:
+    def states(self, t: FloatArray, allowed: FloatArray | None = None) -> FloatArray:
         """As :meth:`at`: segments are short."""
-        return self.at(t)
+        run = self.at(t)
+        return np.concatenate((run.q, run.v), axis=1)
+
+    def unwrapped(self, name: str, t: FloatArray, states: FloatArray) -> FloatArray:
+        """See :meth:`~srm_mbs.simulation.result.SimulationResult.unwrapped`."""
+        return self.at(t).joint(name)[0]
 
     @property
     def span(self) -> tuple[float, float]:

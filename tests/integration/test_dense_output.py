@@ -49,15 +49,14 @@ def test_readings_between_ends_of_steps_err_by_what_is_allowed(name: str) -> Non
     units = mechanism.structure.units
     allowed = rtol * units.state
     counts, found = [], []
-    for read in (lambda: solution.between_ends(t, allowed), lambda: solution.at(t)):
+    for read in (lambda: solution.states(t, allowed), lambda: solution.states(t)):
         before = solution.system.evaluations
         found.append(read())
         counts.append(solution.system.evaluations - before)
     assert counts[0] < 0.5 * counts[1]
-    states = [np.hstack([run.q, run.v]) for run in (*found, exact.at(t))]
     ends, dense = (
-        np.abs(solution.observables.differences(states[2], own) / allowed).max()
-        for own in states[:2]
+        np.abs(solution.observables.differences(exact.states(t), own) / allowed).max()
+        for own in found
     )
     assert ends < dense + 1.0
 

@@ -4,6 +4,7 @@
 
 #include "dense.hpp"
 #include "linear.hpp"
+#include "processor.hpp"
 
 namespace srm {
 
@@ -12,81 +13,116 @@ namespace {
 // Ends around a step through which polynomials lead.  In steps of the loosest reruns of the bundled
 // mechanisms fewer are less often accurate enough, which costs evaluations.
 constexpr int most_ends = 16;
+// Coordinates whose sums stay in registers.
+constexpr int block = 8;
+
+// Of an end of a step the state and the rates of its coordinates (nx,), and their weights in the
+// polynomial, and in its difference from the one through fewer ends.
+struct WeightedEnd {
+    const double *state, *rate;
+    double of_state, of_rate, more_state, more_rate;
+};
+
+// Adds the weighted `ends` to `out`, without the state at `start`, and sets the difference.
+template <int width>
+inline void add_ends(const WeightedEnd* ends, int count, const double* start, int from, double* out,
+                     double* difference) {
+    double sum[width] = {}, other[width] = {};
+    for (int i = 0; i < count; ++i) {
+        const WeightedEnd& end = ends[i];
+        for (int k = 0; k < width; ++k) {
+            const double moved = end.state[from + k] - start[from + k], rate = end.rate[from + k];
+            sum[k] += end.of_state * moved + end.of_rate * rate;
+            other[k] += end.more_state * moved + end.more_rate * rate;
+        }
+    }
+    for (int k = 0; k < width; ++k) {
+        out[from + k] = start[from + k] + sum[k];
+        difference[from + k] = other[k];
+    }
+}
+
+SRM_FOR_PROCESSOR
+void polynomial(const WeightedEnd* ends, int count, const double* start, int nx, double* out,
+                double* difference) {
+    int from = 0;
+    for (; from + block <= nx; from += block)
+        add_ends<block>(ends, count, start, from, out, difference);
+    for (; from + 2 <= nx; from += 2) add_ends<2>(ends, count, start, from, out, difference);
+    if (from < nx) add_ends<1>(ends, count, start, from, out, difference);
+}
 
 }  // namespace
 
 void DenseOutput::between_ends(System& system, const double* t, long k, const double* allowed,
                                double* out) {
     EndNodes ends;
+    EndRates rates;
     std::vector<double> of_coordinates(nx_);
     system.coordinate_errors(allowed, of_coordinates.data());
     for (long i = 0; i < k; ++i, out += nx_) {
         const long step = step_at(t[i]);
         const double theta = (t[i] - steps_.times[step]) /
                              (steps_.times[step + 1] - steps_.times[step]);
-        if (ends.step != step) take_ends(system, step, ends);
+        if (ends.step != step) take_ends(system, step, rates, ends);
         if (!through_ends(system, ends, theta, of_coordinates.data(), out))
             states(system, t + i, 1, out);
     }
 }
 
-// Places and rates at the ends around a step; none where there are not enough.
-void DenseOutput::take_ends(const System& system, long step, EndNodes& ends) const {
+// Rates of the coordinates at an end of a step of the smooth interval that ends at `last`: each of
+// the neighbouring steps needs them.
+const double* DenseOutput::coordinate_rate(const System& system, long node, long last,
+                                           EndRates& rates) const {
+    if (last != rates.last) {  // of a breakpoint, the rates on the other side
+        rates.last = last;
+        rates.known.assign(static_cast<std::size_t>(steps_.count) + 1, 0);
+        rates.rates.resize(rates.known.size() * nx_);
+    }
+    double* const rate = &rates.rates[static_cast<std::size_t>(node) * nx_];
+    if (!rates.known[node]) {
+        system.coordinate_rates(steps_.states + node * nx_, rate_at(node, last), rate);
+        rates.known[node] = 1;
+    }
+    return rate;
+}
+
+// The ends around a step, and the polynomials through them; none where there are not enough.
+void DenseOutput::take_ends(const System& system, long step, EndRates& rates,
+                            EndNodes& ends) const {
     ends.step = step;
     ends.count = 0;
     const Nodes nodes = nodes_away(nullptr, step, most_ends);
     const int count = nodes.count;
     if (count < constants_.nodes[2]) return;
     ends.count = count;
-    ends.places.resize(static_cast<std::size_t>(count) * nx_);
-    ends.rates.resize(static_cast<std::size_t>(count) * nx_);
-    const double *const times = steps_.times, *const start = steps_.states + step * nx_;
+    const double* const times = steps_.times;
     const double h = times[step + 1] - times[step];
     const long last = smooth_interval(step).second;
-    double points[most_nodes];
-    for (int i = 0; i < count; ++i) {
-        const long node = nodes.at[i];
-        const double* const state = steps_.states + node * nx_;
-        double* const place = &ends.places[static_cast<std::size_t>(i) * nx_];
-        double* const rate = &ends.rates[static_cast<std::size_t>(i) * nx_];
-        points[i] = (times[node] - times[step]) / h;
-        system.coordinate_rates(state, rate_at(node, last), rate);
-        for (int k = 0; k < nx_; ++k) {
-            place[k] = state[k] - start[k];
-            rate[k] *= h;
-        }
-    }
-    // The fewer nodes are those nearest to the middle of the step.
-    int order[most_nodes];
-    for (int i = 0; i < count; ++i) order[i] = i;
-    std::stable_sort(order, order + count, [&](int a, int b) {
-        return std::abs(points[a] - 0.5) < std::abs(points[b] - 0.5);
-    });
-    Basis& whole = ends.bases[0];
-    whole.count = count;
+    // In order of their distance from the middle of the step.
+    const double middle = 0.5 * (times[step] + times[step + 1]);
+    int after = 0;
+    while (after < count && times[nodes.at[after]] <= middle) ++after;
     double products[most_nodes];
-    for (int i = 0; i < count; ++i) {
-        whole.at[i] = order[i];
-        whole.points[i] = points[order[i]];
+    for (int i = 0, before = after; i < count; ++i) {
+        const bool left = after == count || (before > 0 && middle - times[nodes.at[before - 1]] <=
+                                                               times[nodes.at[after]] - middle);
+        const long node = nodes.at[left ? --before : after++];
+        ends.states[i] = steps_.states + node * nx_;
+        ends.rates[i] = coordinate_rate(system, node, last, rates);
+        ends.points[i] = (times[node] - times[step]) / h;
         products[i] = 1.0;
-        whole.slopes[i] = 0.0;
+        ends.slopes[i] = 0.0;
+        if (i == count - 1) break;  // the last one is not in both
         for (int j = 0; j < i; ++j) {
-            const double apart = whole.points[i] - whole.points[j], inverse = 1.0 / apart;
+            const double apart = ends.points[i] - ends.points[j], inverse = 1.0 / apart;
             products[i] *= apart;
             products[j] *= -apart;
-            whole.slopes[i] += inverse;
-            whole.slopes[j] -= inverse;
+            ends.slopes[i] += inverse;
+            ends.slopes[j] -= inverse;
         }
     }
-    Basis& less = ends.bases[1] = whole;
-    less.count = count - 1;
-    for (int i = 0; i < count; ++i) {
-        const double apart = whole.points[i] - whole.points[count - 1];
-        whole.weights[i] = 1.0 / products[i];
-        if (i == less.count) break;
-        less.weights[i] = whole.weights[i] * apart;
-        less.slopes[i] -= 1.0 / apart;
-    }
+    for (int i = 0; i < count - 1; ++i) ends.weights[i] = 1.0 / products[i];
 }
 
 // Hermite's polynomial through all of the ends; false if that through one less differs by more than
@@ -94,35 +130,40 @@ void DenseOutput::take_ends(const System& system, long step, EndNodes& ends) con
 bool DenseOutput::through_ends(const System& system, const EndNodes& ends, double theta,
                                const double* allowed, double* out) {
     if (!ends.count) return false;
-    double of_places[2][most_nodes] = {}, of_rates[2][most_nodes] = {};
-    for (int less = 0; less < 2; ++less) {
-        const Basis& basis = ends.bases[less];
-        double before[most_nodes + 1], after = 1.0;  // products of theta - x_j
-        before[0] = 1.0;
-        for (int i = 0; i < basis.count; ++i) before[i + 1] = before[i] * (theta - basis.points[i]);
-        for (int i = basis.count; i-- > 0;) {
-            const double away = theta - basis.points[i];
-            const double value = basis.weights[i] * before[i] * after, square = value * value;
-            after *= away;
-            of_places[less][basis.at[i]] = (1.0 - 2.0 * away * basis.slopes[i]) * square;
-            of_rates[less][basis.at[i]] = away * square;
-        }
+    const double h = steps_.times[ends.step + 1] - steps_.times[ends.step];
+    const int less = ends.count - 1;
+    const double furthest = ends.points[less], to_furthest = theta - furthest;
+    // Products of theta - x_j, those of the ends before each and of all but the furthest.
+    double before[most_nodes], after = 1.0, product = 1.0;
+    for (int i = 0; i < less; ++i) {
+        before[i] = product;
+        product *= theta - ends.points[i];
     }
-    std::copy_n(steps_.states + ends.step * nx_, nx_, out);
-    double* const difference = x_.data();
-    std::fill(difference, difference + nx_, 0.0);
-    for (int i = 0; i < ends.count; ++i) {
-        const double* const place = &ends.places[static_cast<std::size_t>(i) * nx_];
-        const double* const rate = &ends.rates[static_cast<std::size_t>(i) * nx_];
-        const double of_place = of_places[0][i], of_rate = of_rates[0][i];
-        const double more_place = of_place - of_places[1][i], more_rate = of_rate - of_rates[1][i];
-        for (int k = 0; k < nx_; ++k) {
-            out[k] += of_place * place[k] + of_rate * rate[k];
-            difference[k] += more_place * place[k] + more_rate * rate[k];
-        }
+    WeightedEnd weighted[most_nodes];
+    const auto weigh = [&](int i, double whole, double slope, double fewer, double fewer_slope) {
+        const double away = theta - ends.points[i];
+        const double square = whole * whole, fewer_square = fewer * fewer;
+        WeightedEnd& end = weighted[i];
+        end.state = ends.states[i];
+        end.rate = ends.rates[i];
+        end.of_state = (1.0 - 2.0 * away * slope) * square;
+        end.of_rate = h * away * square;
+        end.more_state = end.of_state - (1.0 - 2.0 * away * fewer_slope) * fewer_square;
+        end.more_rate = end.of_rate - h * away * fewer_square;
+    };
+    double product_there = 1.0, slope_there = 0.0;  // at the furthest
+    for (int i = less; i-- > 0;) {
+        const double apart = ends.points[i] - furthest, inverse = 1.0 / apart;
+        const double fewer = ends.weights[i] * before[i] * after;
+        after *= theta - ends.points[i];
+        product_there *= -apart;
+        slope_there -= inverse;
+        weigh(i, fewer * to_furthest * inverse, ends.slopes[i] + inverse, fewer, ends.slopes[i]);
     }
+    weigh(less, product / product_there, slope_there, 0.0, 0.0);
+    polynomial(weighted, ends.count, steps_.states + ends.step * nx_, nx_, out, x_.data());
     for (int k = 0; k < nx_; ++k)
-        if (!(std::abs(difference[k]) <= allowed[k])) return false;
+        if (!(std::abs(x_[k]) <= allowed[k])) return false;
     system.normalise(out);
     return true;
 }

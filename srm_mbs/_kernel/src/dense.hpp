@@ -74,24 +74,26 @@ public:
     static constexpr int most_nodes = 16;  // of a polynomial
 
 private:
-    // Of Hermite's polynomial through some ends: the weights of Lagrange's basis, and its slope at
-    // each end.
-    struct Basis {
-        int count = 0;
-        int at[most_nodes];
-        double points[most_nodes], weights[most_nodes], slopes[most_nodes];
+    // Rates of the coordinates at the ends of steps (steps + 1, nx), as far as they are known, in
+    // the smooth interval that ends at `last`.
+    struct EndRates {
+        long last = -1;
+        std::vector<char> known;
+        std::vector<double> rates;
     };
-    // Ends around a step: the coordinates of their states, without those of the step, and the rates
-    // of these, both (count, nx), and the polynomials through all of them and through those without
-    // the one that is furthest away.
+    // Ends around a step in order of their distance, the states there and the rates of their
+    // coordinates, and of Hermite's polynomial through all of them but the furthest the weights of
+    // Lagrange's basis and its slope at each.
     struct EndNodes {
         long step = -1;
         int count = 0;  // 0: not enough of them
-        std::vector<double> places, rates;
-        Basis bases[2];
+        const double *states[most_nodes], *rates[most_nodes];
+        double points[most_nodes], weights[most_nodes], slopes[most_nodes];
     };
     long step_at(double t) const;
-    void take_ends(const System& system, long step, EndNodes& ends) const;
+    const double* coordinate_rate(const System& system, long node, long last,
+                                  EndRates& rates) const;
+    void take_ends(const System& system, long step, EndRates& rates, EndNodes& ends) const;
     bool through_ends(const System& system, const EndNodes& ends, double theta,
                       const double* allowed, double* out);
     struct Nodes {

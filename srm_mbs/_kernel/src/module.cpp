@@ -406,8 +406,42 @@ struct PySystem {
                       const std::vector<ForceElement>& elements, bool resting) {
         const std::size_t n = count_of(t, states, state_size()), m = elements.size();
         std::vector<double> out(n * m);
-        system->powers(t.data(), states.data(), n, elements, resting, out.data());
+        system->powers(t.data(), states.data(), n, system->separate(elements), resting,
+                       out.data());
         return owned_array(std::move(out), {n, m});
+    }
+
+    // Powers (steps, k, elements) of each of `elements` at the k stages with these rows of A (k, s)
+    // and c (k,) of the `chosen` steps of those with ends at the times (n + 1,), states there
+    // (n + 1, nx) and rates (n, s or more, 2 nv).
+    nb::object stage_powers(const std::vector<long>& chosen, const Array& times,
+                            const Array& states, const Array& rates, const Array& A,
+                            const Array& c, const std::vector<ForceElement>& elements) {
+        const std::size_t nx = state_size(), n = 2 * static_cast<std::size_t>(system->nv);
+        const std::size_t stages = c.size(), m = elements.size(), ends = count_of(times, states, static_cast<int>(nx));
+        if (rates.ndim() != 3 || rates.shape(0) + 1 != ends || rates.shape(2) != n || !stages ||
+            A.size() % stages != 0 || A.size() / stages > rates.shape(1))
+            throw nb::value_error("rates or A has another shape");
+        const std::size_t s = A.size() / stages, width = rates.shape(1);
+        const SeparateElements each = system->separate(elements);
+        std::vector<double> out(chosen.size() * stages * m), t(stages), x(stages * nx), moved(n);
+        double* powers = out.data();
+        for (const long step : chosen) {
+            expect_within("chosen", step, 0, static_cast<long>(ends) - 2);
+            const double h = times.data()[step + 1] - times.data()[step];
+            const double* const own = rates.data() + step * width * n;
+            for (std::size_t i = 0; i < stages; ++i) {
+                std::fill(moved.begin(), moved.end(), 0.0);
+                for (std::size_t j = 0; j < s; ++j)
+                    if (const double a = A.data()[i * s + j]; a != 0.0)
+                        add(h * a, own + j * n, moved.data(), static_cast<int>(n));
+                system->retract(states.data() + step * nx, moved.data(), &x[i * nx]);
+                t[i] = times.data()[step] + h * c.data()[i];
+            }
+            system->powers(t.data(), x.data(), stages, each, false, powers);
+            powers += stages * m;
+        }
+        return owned_array(std::move(out), {chosen.size(), stages, m});
     }
 
     // Takes terms from a GeneratedTerms from now on; None: from the pass over the tree.
@@ -497,6 +531,8 @@ void bind_system(nb::module_& m) {
         .def("differences", &PySystem::differences, nb::arg("from"), nb::arg("to"))
         .def("moved", &PySystem::moved, nb::arg("states"), nb::arg("motions"))
         .def("energies", &PySystem::energies)
+        .def("stage_powers", &PySystem::stage_powers, nb::arg("chosen"), nb::arg("times"),
+             nb::arg("states"), nb::arg("rates"), nb::arg("A"), nb::arg("c"), nb::arg("elements"))
         .def("powers", &PySystem::powers, nb::arg("t"), nb::arg("states"), nb::arg("elements"),
              nb::arg("resting"))
         .def("linearisation", &PySystem::linearisation, nb::arg("constants"), nb::arg("t"),

@@ -310,20 +310,10 @@ double* System::column(int row) {
 void System::update_closures(const double* q, bool with_bias) {
     for (const ClosureRows& closure : data_.closures) {
         if (!closure.directions.empty() || !closure.distances.empty())
-            update_positions(closure, with_bias);
-        if (!closure.alignments.empty()) update_alignments(closure, with_bias);
+            update_positions(closure, with_bias, nullptr);
+        if (!closure.alignments.empty()) update_alignments(closure, with_bias, nullptr);
     }
-    for (const JointRow& joints : data_.joint_rows) {
-        double* const out = column(joints.row);
-        double g = -joints.offset;
-        for (std::size_t k = 0; k < joints.coefficients.size(); ++k) {
-            out[joints.in_v[k]] = joints.coefficients[k];
-            g += joints.coefficients[k] * q[joints.in_q[k]];
-        }
-        g_[joints.row] = g;
-        bias_[joints.row] = 0.0;
-        if (!joints.powers.empty()) update_powers(joints, q, with_bias);
-    }
+    for (const JointRow& joints : data_.joint_rows) update_joints(joints, q, with_bias);
     for (const Elimination& e : data_.eliminations) {
         double* const out = filled(e.row);
         const double* const other = filled(e.other);
@@ -331,6 +321,18 @@ void System::update_closures(const double* q, bool with_bias) {
         g_[e.row] -= e.factor * g_[e.other];
         if (with_bias) bias_[e.row] -= e.factor * bias_[e.other];
     }
+}
+
+void System::update_joints(const JointRow& joints, const double* q, bool with_bias) {
+    double* const out = column(joints.row);
+    double g = -joints.offset;
+    for (std::size_t k = 0; k < joints.coefficients.size(); ++k) {
+        out[joints.in_v[k]] = joints.coefficients[k];
+        g += joints.coefficients[k] * q[joints.in_q[k]];
+    }
+    g_[joints.row] = g;
+    bias_[joints.row] = 0.0;
+    if (!joints.powers.empty()) update_powers(joints, q, with_bias);
 }
 
 // The powers of a joint row: P(y) of g, P'(y) b of G and P''(y) (b . v)^2 of Gdot v.
@@ -371,14 +373,19 @@ void System::fill(const ClosureRows& closure, int row, const Vec& force, const V
 //
 // x is the point of anchor a in the world, p its offset from the point of anchor b in the axes of
 // b, r and bias the first derivative of p and the second without accelerations of the joints.
-void System::update_positions(const ClosureRows& closure, bool with_bias) {
+// With `rates` (rows,) the bodies move, and G v is written there instead of G v's derivative and G.
+void System::update_positions(const ClosureRows& closure, bool with_bias, double* rates) {
     const Body a(work_->data, closure.joint_a), b(work_->data, closure.joint_b);
     const bool ground = closure.joint_b == 0;
     const Vec at_a = vec(closure.at_a.data());
     const Vec x = to_world(a.rotation, at_a) + a.origin();
     const Vec at_b = ground ? x : from_world(b.rotation, x - b.origin());
     Vec r{}, bias{};
-    if (with_bias) {
+    if (rates) {
+        r = to_world(a.rotation, a.velocity() + cross(a.spin(), at_a));
+        if (!ground)
+            r = from_world(b.rotation, r) - (b.velocity() + cross(b.spin(), at_b));
+    } else if (with_bias) {
         const Vec speed = a.velocity() + cross(a.spin(), at_a);
         bias = a.bias() + cross(a.spin_bias(), at_a) + cross(a.spin(), speed);
         bias = to_world(a.rotation, bias);
@@ -398,9 +405,13 @@ void System::update_positions(const ClosureRows& closure, bool with_bias) {
     const Vec p = at_b - vec(closure.at_b.data());
     int row = closure.first_row;
     const auto along = [&](const Vec& d, double g, double rate) {
+        g_[row] = g;
+        if (rates) {
+            rates[row++] = dot(d, r);
+            return;
+        }
         const Vec e = ground ? d : to_world(b.rotation, d);
         fill(closure, row, e, cross(x, e));
-        g_[row] = g;
         if (with_bias) bias_[row] = rate;
         ++row;
     };
@@ -420,12 +431,15 @@ void System::update_positions(const ClosureRows& closure, bool with_bias) {
 }
 
 // Rows that keep directions u of a and n of b perpendicular: g = n . m, m = u in the axes of b.
-// w and bias are the angular velocity of a against b and its derivative without accelerations.
-void System::update_alignments(const ClosureRows& closure, bool with_bias) {
+// w and bias are the angular velocity of a against b and its derivative without accelerations;
+// `rates` as for update_positions().
+void System::update_alignments(const ClosureRows& closure, bool with_bias, double* rates) {
     const Body a(work_->data, closure.joint_a), b(work_->data, closure.joint_b);
     const auto seen = [&](const Vec& v) { return from_world(b.rotation, to_world(a.rotation, v)); };
     Vec w{}, bias{};
-    if (with_bias) {
+    if (rates) {
+        w = seen(a.spin()) - b.spin();
+    } else if (with_bias) {
         const Vec carried = b.spin(), spin = seen(a.spin());
         w = spin - carried;
         bias = seen(a.spin_bias()) - b.spin_bias() - cross(carried, spin);
@@ -434,8 +448,12 @@ void System::update_alignments(const ClosureRows& closure, bool with_bias) {
     int row = closure.first_row + static_cast<int>(before);
     for (std::size_t k = 0; k < closure.alignments.size(); k += 6, ++row) {
         const Vec m = seen(vec(&closure.alignments[k])), n = vec(&closure.alignments[k + 3]);
-        fill(closure, row, Vec{}, to_world(b.rotation, cross(m, n)));
         g_[row] = dot(n, m);
+        if (rates) {
+            rates[row] = dot(n, cross(w, m));
+            continue;
+        }
+        fill(closure, row, Vec{}, to_world(b.rotation, cross(m, n)));
         if (with_bias) bias_[row] = dot(n, cross(bias, m) + cross(w, cross(w, m)));
     }
 }
@@ -1413,27 +1431,31 @@ const ColumnGroups& System::column_groups() {
     return columns_;
 }
 
+// The velocities of the bodies give the rates of closures without their rows of G.
 void System::closure_errors(double t, const double* state, double* g, double* rates) {
     move_bodies(state);
-    pinocchio::computeJointJacobians(work_->model, work_->data);
-    update_closures(state, false);
-    update_drives(t, false);
-    std::copy(g_.begin(), g_.end(), g);
     const double* const v = state + nq;
-    const auto rate = [&](int row, const std::vector<int>& columns) {
-        const double* const G = filled(row);
-        rates[row] = 0.0;
-        for (const int j : columns) rates[row] += G[j] * v[j];
-    };
-    for (const ClosureRows& closure : data_.closures)
-        for (std::size_t k = 0; k < closure.count(); ++k)
-            rate(closure.first_row + static_cast<int>(k), closure.columns);
-    for (const JointRow& joints : data_.joint_rows) rate(joints.row, joints.in_v);
-    for (const Elimination& e : data_.eliminations) rate(e.row, e.columns);
+    for (const ClosureRows& closure : data_.closures) {
+        if (!closure.directions.empty() || !closure.distances.empty())
+            update_positions(closure, false, rates);
+        if (!closure.alignments.empty()) update_alignments(closure, false, rates);
+    }
+    for (const JointRow& joints : data_.joint_rows) {
+        update_joints(joints, state, false);
+        const double* const G = filled(joints.row);
+        rates[joints.row] = 0.0;
+        for (const int j : joints.in_v) rates[joints.row] += G[j] * v[j];
+    }
+    for (const Elimination& e : data_.eliminations) {
+        g_[e.row] -= e.factor * g_[e.other];
+        rates[e.row] -= e.factor * rates[e.other];
+    }
+    update_drives(t, false);
     for (const DrivenRow& drive : data_.drives) {
-        if (drive.in_v >= 0) rate(drive.row, {drive.in_v});
+        if (drive.in_v >= 0) rates[drive.row] = drive.factor * v[drive.in_v];
         rates[drive.row] -= pushed_[drive.row];
     }
+    std::copy(g_.begin(), g_.end(), g);
 }
 
 std::array<double, 2> System::energies(const double* state) {
@@ -1449,20 +1471,26 @@ std::array<double, 2> System::energies(const double* state) {
     return {kinetic, potential};
 }
 
+SeparateElements System::separate(const std::vector<ForceElement>& elements) const {
+    SeparateElements each;
+    for (const ForceElement& element : elements) {
+        check_indices(element, work_->model);
+        each.push_back({element});
+    }
+    return each;
+}
+
 void System::powers(const double* t, const double* states, std::size_t n,
-                    const std::vector<ForceElement>& elements, bool resting, double* out) {
+                    const SeparateElements& each, bool resting, double* out) {
     auto& w = *work_;
     std::vector<BushingStep> none;
-    std::vector<std::vector<ForceElement>> each;
     const auto on_bodies = [](const ForceElement& e) {  // others depend on coordinates alone
         return e.kind == ForceKind::spring_damper || e.kind == ForceKind::wrench ||
                e.kind == ForceKind::bushing;
     };
-    for (const ForceElement& element : elements) {
-        check_indices(element, w.model);
-        each.push_back({element});
-    }
-    const bool bodies = std::any_of(elements.begin(), elements.end(), on_bodies);
+    const bool bodies = std::any_of(each.begin(), each.end(), [&](const auto& one) {
+        return on_bodies(one.front());
+    });
     std::vector<double> wrenches(6 * w.model.njoints);
     const auto power_on = [&](int joint) {
         const pinocchio::Motion motion = w.data.oMi[joint].act(w.data.v[joint]);

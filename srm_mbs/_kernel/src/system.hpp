@@ -137,6 +137,9 @@ struct ColumnGroups {
     std::vector<std::vector<int>> groups;      // of coordinates without a common neighbour
 };
 
+// Force elements whose powers are separate, each a list of its own.
+using SeparateElements = std::vector<std::vector<ForceElement>>;
+
 class System {
 public:
     System(const void* model, SystemData data, Controller controller);
@@ -232,12 +235,12 @@ public:
     int rows() const { return data_.rows; }
     // With all terms of other states lost: of one state g - s and G v - s' (rows,), and the kinetic
     // and the potential energy, of gravity and of springs; of n states the powers (n, forces) of
-    // `elements`, each by itself, at the rates of the state or, if it is `resting`, those of its
-    // force at rest.
+    // `each` element at the rates of the state or, if it is `resting`, those of its force at rest.
     void closure_errors(double t, const double* state, double* g, double* rates);
     std::array<double, 2> energies(const double* state);
     void powers(const double* t, const double* states, std::size_t n,
-                const std::vector<ForceElement>& elements, bool resting, double* out);
+                const SeparateElements& each, bool resting, double* out);
+    SeparateElements separate(const std::vector<ForceElement>& elements) const;
     // Of the stage evaluated last: M x (nv,), all forces but those of closures (nv,), those among
     // them but those of inertia (nv,), and Gdot v - s'' (rows,).
     // Also then, in the order of the drives: the forces on their coordinates; false where rows
@@ -325,8 +328,9 @@ private:
     // Index in q of the cosine of a wrapped angle; the sine follows.
     int cosine_of(std::size_t angle) const;
     void update_powers(const JointRow& joints, const double* q, bool with_bias);
-    void update_positions(const ClosureRows& closure, bool with_bias);
-    void update_alignments(const ClosureRows& closure, bool with_bias);
+    void update_positions(const ClosureRows& closure, bool with_bias, double* rates);
+    void update_alignments(const ClosureRows& closure, bool with_bias, double* rates);
+    void update_joints(const JointRow& joints, const double* q, bool with_bias);
     void fill(const ClosureRows& closure, int row, const Vec& force, const Vec& moment);
     void update_drives(double t, bool with_bias);
     void completed(const double* white, double* out) const;

@@ -72,8 +72,10 @@ def drift_of(solution: SimulationResult) -> tuple[Drift, ...]:
         if part.steps.stop is not None:  # an event within the last step
             ends = ends[:-1]
         count = len(ends)
-        run = part.at(np.concatenate((ends, even_times(part))))
-        squares = [e * e for e in run.observables.closure_errors(run.t, run.q, run.v)]
+        t, nq = np.concatenate((ends, even_times(part))), mechanism.model.nq
+        states = part.states(t)
+        errors = part.observables.closure_errors(t, states[:, :nq], states[:, nq:])
+        squares = [e * e for e in errors]
         angles = constraint_angles(mechanism)
         length = mechanism.structure.units.length
         for unit, own, scale in (("m", ~angles, length), ("rad", angles, 1.0)):

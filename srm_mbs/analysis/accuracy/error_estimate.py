@@ -301,7 +301,9 @@ def estimate_error(
     return ErrorEstimate(
         fixed,
         tuple(trials),
-        tuple(
+        compared.joints
+        if beyond == 1.0
+        else tuple(
             replace(row, position=beyond * row.position, rate=beyond * row.rate)
             for row in compared.joints
         ),
@@ -402,14 +404,14 @@ class Readings:
         self._solution = solution
         unit = solution.mechanism.structure.units.state
         self._allowed = None if allowed is None else allowed * unit
-        self._known: dict[tuple[int, bytes], SimulationResult] = {}
+        self._known: dict[tuple[int, bytes], FloatArray] = {}
 
-    def __call__(self, run: SimulationResult, times: FloatArray) -> SimulationResult:
+    def __call__(self, run: SimulationResult, times: FloatArray) -> FloatArray:
+        """States (n, nq + nv) at the ``times`` (n,) s."""
         key = id(run), times.tobytes()
         found = self._known.get(key)
         if found is None:
-            allowed = None if run is self._solution else self._allowed
-            found = run.at(times) if allowed is None else run.between_ends(times, allowed)
+            found = run.states(times, None if run is self._solution else self._allowed)
             self._known[key] = found
         return found
 
@@ -426,30 +428,33 @@ class Differences(Sizes):
         As in :class:`Comparison`.
     apart, rates : (n, nv)
         Motions from one to the other, and changes of the rates.
+    states : (n, nq + nv)
+        Those of the first one.
     run
-        The first one, read at ``t``.
+        The first one.
     """
 
     jumps: FloatArray
     apart: FloatArray
     rates: FloatArray
+    states: FloatArray
     run: SimulationResult
 
     def comparison(self) -> Comparison:
         """With the largest difference of each joint."""
-        mechanism, run = self.run.mechanism, self.run
-        states = np.concatenate((run.q, run.v), axis=1)
+        mechanism, run, states = self.run.mechanism, self.run, self.states
+        model = mechanism.model
         start = np.repeat(states[:1], len(states), axis=0)
-        moved = run.segments[0].observables.differences(start, states)[:, : mechanism.model.nv]
+        moved = run.segments[0].observables.differences(start, states)[:, : model.nv]
         for name, k in _turning_joints(mechanism):
-            angle, _ = run.joint(name)  # unwrapped
+            angle = run.unwrapped(name, self.t, states)
             moved[:, k] = angle - angle[:1]
         parts = _parts(mechanism)
         # The norm over the coordinates of each part, at the time at which it is largest.
-        largest = [_largest_norms(x, parts) for x in (self.apart, self.rates, moved, run.v)]
+        changes = (self.apart, self.rates, moved, states[:, model.nq :])
+        largest = [parts.largest_norms(x) for x in changes]
         joints = tuple(
-            JointDifference(name, unit, *numbers)
-            for (name, unit, _), *numbers in zip(parts, *largest)
+            JointDifference(*own, *numbers) for own, *numbers in zip(parts.names, *largest)
         )
         return Comparison(self.t, self.size, joints, self.jumps)
 
@@ -468,29 +473,44 @@ def compare(
         times = times[allowed]
     mechanism, nv = run.mechanism, run.mechanism.model.nv
     a, b = read(run, times), read(other, times)
-    states = (np.concatenate((one.q, one.v), axis=1) for one in (a, b))
-    both = run.segments[0].observables.differences(*states)
+    both = run.segments[0].observables.differences(a, b)
     apart, rates = both[:, :nv], both[:, nv:]
     for name, k in _turning_joints(mechanism):
-        apart[:, k] = b.joint(name)[0] - a.joint(name)[0]  # unwrapped
+        apart[:, k] = other.unwrapped(name, times, b) - run.unwrapped(name, times, a)
     parts = np.abs(both / mechanism.structure.units.state)
     size = np.empty((len(times), 2))
     np.maximum.reduce(parts[:, :nv], axis=1, initial=0.0, out=size[:, 0])
     np.maximum.reduce(parts[:, nv:], axis=1, initial=0.0, out=size[:, 1])
-    return Differences(times, size, jumps, apart, rates, a)
+    return Differences(times, size, jumps, apart, rates, a, run)
 
 
-def _largest_norms(x: FloatArray, parts: list[tuple[str, str, IndexArray]]) -> list[float]:
-    """Of the coordinates of each part in the rows of x (n, nv) the largest norm in any row."""
-    order = np.concatenate([own for _, _, own in parts])
-    if len(order) == len(parts):  # one coordinate each
-        largest = np.abs(x).max(axis=0, initial=0.0)[order]
-    else:
-        starts = np.cumsum([0, *(len(own) for _, _, own in parts[:-1])])
-        squares = np.add.reduceat(x[:, order] ** 2, starts, axis=1)
-        largest = np.sqrt(squares.max(axis=0, initial=0.0))
-    found: list[float] = largest.tolist()
-    return found
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """The lengths and the angles of each joint.
+
+    Attributes
+    ----------
+    names
+        Joint and unit of each part.
+    order : (nv,)
+        Velocity indices of their coordinates, one part after the other.
+    starts
+        Where they begin in ``order``; None if each has one coordinate.
+    """
+
+    names: list[tuple[str, str]]
+    order: IndexArray
+    starts: IndexArray | None
+
+    def largest_norms(self, x: FloatArray) -> list[float]:
+        """Of the coordinates of each part in the rows of x (n, nv) the largest norm in any row."""
+        if self.starts is None:
+            largest = np.abs(x).max(axis=0, initial=0.0)[self.order]
+        else:
+            squares = np.add.reduceat(x[:, self.order] ** 2, self.starts, axis=1)
+            largest = np.sqrt(squares.max(axis=0, initial=0.0))
+        found: list[float] = largest.tolist()
+        return found
 
 
 @per_model
@@ -501,17 +521,20 @@ def _turning_joints(mechanism: MechanismData) -> list[tuple[str, int]]:
 
 
 @per_model
-def _parts(mechanism: MechanismData) -> list[tuple[str, str, IndexArray]]:
-    """(joint, unit, velocity indices): the lengths and the angles of each joint."""
+def _parts(mechanism: MechanismData) -> Parts:
+    """The parts of all joints."""
     turns = angle_coordinates(mechanism.model)
-    parts = []
+    names, indices = [], []
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
         own = np.arange(joint.idx_v, joint.idx_v + joint.nv)
         for unit, chosen in (("m", own[~turns[own]]), ("rad", own[turns[own]])):
             if len(chosen):
-                parts.append((name, unit, chosen))
-    return parts
+                names.append((name, unit))
+                indices.append(chosen)
+    starts = np.cumsum([0, *(len(own) for own in indices[:-1])])
+    order = np.concatenate(indices)
+    return Parts(names, order, None if len(order) == len(names) else starts)
 
 
 def _jump_times(run: SimulationResult) -> Sequence[float]:

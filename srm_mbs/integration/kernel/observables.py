@@ -10,7 +10,7 @@ import numpy as np
 
 from srm_mbs._kernel import core
 from srm_mbs._kernel.workspace import LARGE
-from srm_mbs._typing import FloatArray
+from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.reactions import Reactions, named_reactions
 from srm_mbs.dynamics.constraints.rheonomic import all_rows, constraint_errors, unscaled_rows
@@ -18,7 +18,11 @@ from srm_mbs.dynamics.constraints.row_algebra import INERT, SingularValues, acti
 from srm_mbs.dynamics.forces import ForceKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
-from srm_mbs.dynamics.observables import Observables
+from srm_mbs.dynamics.observables import (
+    Observables,
+    conservative_elements,
+    working_elements,
+)
 from srm_mbs.integration.kernel.marshalling import force_struct, system_struct
 from srm_mbs.integration.kernel.system import KEPT, workspace
 from srm_mbs.model.drives import in_order_of_rows
@@ -244,6 +248,30 @@ class CompiledObservables(Observables):
                 return super()._powers(elements, t, q, v, resting)
             powers |= dict(zip(compiled, found.T))
         return {name: powers[name] for name in elements}
+
+    def stage_powers(
+        self,
+        chosen: IndexArray,
+        times: FloatArray,
+        states: FloatArray,
+        rates: FloatArray,
+        A: FloatArray,
+        c: FloatArray,
+    ) -> dict[str, FloatArray]:
+        mechanism = self.mechanism
+        own = [element.constants() for element in working_elements(mechanism).values()]
+        if all(own) and not conservative_elements(mechanism):
+            structs = [force_struct(**constants[0]) for constants in own]
+            try:
+                with self._all_rows() as kernel_system:
+                    found = kernel_system.stage_powers(
+                        chosen.tolist(), times, states, rates, A, c, structs
+                    )
+            except ArithmeticError:
+                pass  # the reference raises the error that says why
+            else:
+                return dict(zip(working_elements(mechanism), np.moveaxis(found, 2, 0)))
+        return super().stage_powers(chosen, times, states, rates, A, c)
 
 
 def _loaded(system: OpenSystem | ClosedSystem) -> Observables:

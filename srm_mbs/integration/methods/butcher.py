@@ -34,13 +34,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from srm_mbs._typing import FloatArray
+from srm_mbs._typing import FloatArray, IndexArray
 
 ExactRow = tuple[Fraction, ...]
 ExactMatrix = tuple[ExactRow, ...]
 
 _ROUNDING = 1e-13
 """Sums of coefficients agree up to rounding; a wrong digit in the data is far above this."""
+SAME_STAGE = 1e-9
+"""Distance of two stages, over the step, below which they are at the same time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,6 +283,12 @@ class ButcherTableau(_Record):
     def abscissae(self) -> FloatArray:
         """Abscissae (s + 1,) of the stages and of the end."""
         return np.append(self.c, 1.0)
+
+    @cached_property
+    def distinct(self) -> IndexArray:
+        """Places in ``abscissae`` of those after 0 in order of time, each time once."""
+        order = np.argsort(self.abscissae, kind="stable")
+        return order[np.diff(self.abscissae[order], prepend=0.0) > SAME_STAGE]
 
     @cached_property
     def gaps(self) -> tuple[tuple[float, float], ...]:

@@ -171,7 +171,9 @@ def test_a_switch_to_another_branch_is_seen_in_the_velocities(ratio: float, swit
     arriving = srm.simulate(mechanism, 0.5, q0=q0, v0=v0, **options)
     leaving = srm.simulate(mechanism, 0.5, q0=[0.5 * PI, -PI], v0=[3.0, 3.0 * ratio], **options)
     run: Any = Joined(arriving, leaving)
-    (crossing,) = find_crossings(make_system(mechanism), arriving.scheme, run.steps, run)
+    (crossing,) = find_crossings(
+        make_system(mechanism), arriving.scheme, run.steps, lambda: (run, 0.0)
+    )
     assert crossing.time == pytest.approx(0.5, abs=1e-5)
     assert crossing.switched is switched
     assert crossing.arrived_on is not None

@@ -13,9 +13,6 @@ namespace {
 // Ends around a step through which polynomials lead.  In steps of the loosest reruns of the bundled
 // mechanisms fewer are less often accurate enough, which costs evaluations.
 constexpr int most_ends = 16;
-// Coordinates whose sums stay in registers.
-constexpr int block = 8;
-
 // Of an end of a step the state and the rates of its coordinates (nx,), and their weights in the
 // polynomial, and in its difference from the one through fewer ends.
 struct WeightedEnd {
@@ -23,33 +20,19 @@ struct WeightedEnd {
     double of_state, of_rate, more_state, more_rate;
 };
 
-// Adds the weighted `ends` to `out`, without the state at `start`, and sets the difference.
-template <int width>
-inline void add_ends(const WeightedEnd* ends, int count, const double* start, int from, double* out,
-                     double* difference) {
-    double sum[width] = {}, other[width] = {};
-    for (int i = 0; i < count; ++i) {
-        const WeightedEnd& end = ends[i];
-        for (int k = 0; k < width; ++k) {
-            const double moved = end.state[from + k] - start[from + k], rate = end.rate[from + k];
-            sum[k] += end.of_state * moved + end.of_rate * rate;
-            other[k] += end.more_state * moved + end.more_rate * rate;
-        }
-    }
-    for (int k = 0; k < width; ++k) {
-        out[from + k] = start[from + k] + sum[k];
-        difference[from + k] = other[k];
-    }
-}
-
+// Adds two weighted ends, without the state at `start`, to `out` and to the difference (nx,).
 SRM_FOR_PROCESSOR
-void polynomial(const WeightedEnd* ends, int count, const double* start, int nx, double* out,
-                double* difference) {
-    int from = 0;
-    for (; from + block <= nx; from += block)
-        add_ends<block>(ends, count, start, from, out, difference);
-    for (; from + 2 <= nx; from += 2) add_ends<2>(ends, count, start, from, out, difference);
-    if (from < nx) add_ends<1>(ends, count, start, from, out, difference);
+void add_ends(const WeightedEnd& a, const WeightedEnd& b, const double* start, int nx,
+              double* __restrict__ out, double* __restrict__ difference) {
+    const double *const x = a.state, *const y = b.state, *const u = a.rate, *const w = b.rate;
+    const double of_x = a.of_state, of_y = b.of_state, of_u = a.of_rate, of_w = b.of_rate;
+    const double more_x = a.more_state, more_y = b.more_state;
+    const double more_u = a.more_rate, more_w = b.more_rate;
+    for (int k = 0; k < nx; ++k) {
+        const double from_x = x[k] - start[k], from_y = y[k] - start[k];
+        out[k] += of_x * from_x + of_u * u[k] + (of_y * from_y + of_w * w[k]);
+        difference[k] += more_x * from_x + more_u * u[k] + (more_y * from_y + more_w * w[k]);
+    }
 }
 
 }  // namespace
@@ -139,7 +122,7 @@ bool DenseOutput::through_ends(const System& system, const EndNodes& ends, doubl
         before[i] = product;
         product *= theta - ends.points[i];
     }
-    WeightedEnd weighted[most_nodes];
+    WeightedEnd weighted[most_nodes + 1];
     const auto weigh = [&](int i, double whole, double slope, double fewer, double fewer_slope) {
         const double away = theta - ends.points[i];
         const double square = whole * whole, fewer_square = fewer * fewer;
@@ -161,7 +144,16 @@ bool DenseOutput::through_ends(const System& system, const EndNodes& ends, doubl
         weigh(i, fewer * to_furthest * inverse, ends.slopes[i] + inverse, fewer, ends.slopes[i]);
     }
     weigh(less, product / product_there, slope_there, 0.0, 0.0);
-    polynomial(weighted, ends.count, steps_.states + ends.step * nx_, nx_, out, x_.data());
+    if (ends.count % 2) {
+        weighted[ends.count] = weighted[less];
+        WeightedEnd& none = weighted[ends.count];
+        none.of_state = none.of_rate = none.more_state = none.more_rate = 0.0;
+    }
+    const double* const start = steps_.states + ends.step * nx_;
+    std::copy_n(start, nx_, out);
+    std::fill_n(x_.data(), nx_, 0.0);
+    for (int i = 0; i < ends.count; i += 2)
+        add_ends(weighted[i], weighted[i + 1], start, nx_, out, x_.data());
     for (int k = 0; k < nx_; ++k)
         if (!(std::abs(x_[k]) <= allowed[k])) return false;
     system.normalise(out);

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from math import copysign, inf, pi, sqrt, tanh
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -930,7 +931,7 @@ class ForceKinematics:
         """Potential energy (J) of springs and bushings; ``data`` must hold the placements."""
         return sum(element.energy(data, q) for element in self._elements)
 
-    @property
+    @cached_property
     def has_user_forces(self) -> bool:
         """Whether there are functions of the user among the elements."""
         return any(isinstance(element, _UserForceEvaluator) for element in self._elements)

@@ -22,7 +22,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.observables import LINEAR, Observables, working_elements
@@ -212,16 +212,20 @@ class Nodes:
             parts.append(self.observables.powers(run.t, run.q, run.v))
         return {name: np.concatenate([part[name].ravel() for part in parts]) for name in parts[0]}
 
+    @cached_property
+    def _weights(self) -> tuple[BoolArray, FloatArray, FloatArray]:
+        """The intervals (n,) with stages, and the weights (n, nodes) s of the nodes of these and of
+        the others."""
+        at_stages, lengths = self._steps >= 0, np.diff(self._ends)
+        stages = np.outer(lengths[at_stages], self._scheme.b[self._stages])
+        return at_stages, stages, np.outer(lengths[~at_stages], 0.5 * self._gauss[1])
+
     def work(self, power: FloatArray) -> FloatArray:
         """Work (n,) J in each interval of the ``power`` (k,) W."""
-        at_stages, read = self._steps >= 0, self._steps < 0
-        count = len(self._started) * len(self._stages)
-        out = np.diff(self._ends)
-        out[at_stages] *= (
-            power[:count].reshape(-1, len(self._stages)) @ self._scheme.b[self._stages]
-        )
-        _, weights = self._gauss
-        out[read] *= power[count:].reshape(-1, len(weights)) @ (0.5 * weights)
+        at_stages, stages, read = self._weights
+        out = np.empty(len(at_stages))
+        out[at_stages] = (power[: stages.size].reshape(stages.shape) * stages).sum(axis=1)
+        out[~at_stages] = (power[stages.size :].reshape(read.shape) * read).sum(axis=1)
         return out
 
 

@@ -26,6 +26,11 @@ SE3 placement(const Anchor& anchor, const pinocchio::Data& data) {
     return anchor.joint ? data.oMi[anchor.joint] * inside : inside;
 }
 
+Vector3d origin(const Anchor& anchor, const pinocchio::Data& data) {
+    const Eigen::Map<const Vector3d> inside(anchor.placement.data() + 9);
+    return anchor.joint ? data.oMi[anchor.joint].act(Vector3d(inside)) : Vector3d(inside);
+}
+
 // Spatial velocity of the body, in world axes at the world origin.
 Motion velocity(const Anchor& anchor, const pinocchio::Data& data) {
     return anchor.joint ? data.oMi[anchor.joint].act(data.v[anchor.joint]) : Motion::Zero();
@@ -35,7 +40,8 @@ Vector3d point_velocity(const Motion& body, const Vector3d& point) {
     return body.linear() + body.angular().cross(point);
 }
 
-// What elements add to: generalised forces (nv,), and wrenches (njoints, 6) on bodies, or null.
+// What elements add to: generalised forces (nv,), and wrenches (njoints, 6) on bodies; one may be
+// null.
 struct Sums {
     double* tau;
     double* on_bodies;
@@ -46,7 +52,7 @@ void add_wrench(const ForceElement& e, const pinocchio::Data& data, const Vector
                 const Vector3d& moment, const Vector3d& point, const Sums& sums) {
     Vector6 wrench;
     wrench << force, moment + point.cross(force);
-    for (std::size_t k = 0; k < e.columns.size(); ++k)
+    for (std::size_t k = 0; sums.tau && k < e.columns.size(); ++k)
         sums.tau[e.columns[k]] += e.signs[k] * data.J.col(e.columns[k]).dot(wrench);
     if (!sums.on_bodies) return;
     Eigen::Map<Vector6>(sums.on_bodies + 6 * e.a.joint) += wrench;
@@ -61,8 +67,7 @@ double stretched(const ForceElement& e, double beyond) {
 
 void spring_damper(const ForceElement& e, double coincident, const pinocchio::Data& data,
                    const Sums& sums, ForceLaws* laws, int law) {
-    const Vector3d at_a = placement(e.a, data).translation();
-    const Vector3d at_b = placement(e.b, data).translation();
+    const Vector3d at_a = origin(e.a, data), at_b = origin(e.b, data);
     const Vector3d apart = at_a - at_b;
     const double length = apart.norm();
     if (length < coincident * e.rest) throw EvaluationError{Failure::coincident};
@@ -215,10 +220,8 @@ double energy(const ForceElement& e, const pinocchio::Data& data, const double* 
     switch (e.kind) {
         case ForceKind::spring_damper:
             return linear_energy(
-                e.stiffness, stretched(e, (placement(e.a, data).translation() -
-                                           placement(e.b, data).translation())
-                                                  .norm() -
-                                              e.rest));
+                e.stiffness,
+                stretched(e, (origin(e.a, data) - origin(e.b, data)).norm() - e.rest));
         case ForceKind::torsion_spring:
             return linear_energy(e.stiffness, q[e.in_q] - e.rest);
         case ForceKind::bushing:

@@ -1507,10 +1507,13 @@ void System::powers(const double* t, const double* states, std::size_t n,
         for (const std::vector<ForceElement>& one : each) {
             const ForceElement& e = one.front();
             const bool by_wrenches = !resting && on_bodies(e);
-            std::fill(f_.begin(), f_.end(), 0.0);
-            for (const int joint : {e.a.joint, e.b.joint})
-                if (by_wrenches) std::fill_n(&wrenches[6 * joint], 6, 0.0);
-            add_forces(one, data_.coincident, w, t[i], states, w.v.data(), none, f_.data(), nullptr,
+            if (by_wrenches)
+                for (const int joint : {e.a.joint, e.b.joint})
+                    std::fill_n(&wrenches[6 * joint], 6, 0.0);
+            else
+                std::fill(f_.begin(), f_.end(), 0.0);
+            add_forces(one, data_.coincident, w, t[i], states, w.v.data(), none,
+                       by_wrenches ? nullptr : f_.data(), nullptr,
                        by_wrenches ? wrenches.data() : nullptr);
             if (!by_wrenches) *out++ = dot(f_.data(), v, nv);
             else *out++ = power_on(e.a.joint) +

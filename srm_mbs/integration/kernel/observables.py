@@ -26,7 +26,7 @@ from srm_mbs.dynamics.observables import (
 from srm_mbs.integration.kernel.marshalling import force_struct, system_struct
 from srm_mbs.integration.kernel.system import KEPT, workspace
 from srm_mbs.model.drives import in_order_of_rows
-from srm_mbs.model.mechanism import per_model
+from srm_mbs.model.mechanism import MechanismData, per_model
 
 
 def _make_all_rows(system: ClosedSystem | OpenSystem) -> Any:
@@ -258,20 +258,27 @@ class CompiledObservables(Observables):
         A: FloatArray,
         c: FloatArray,
     ) -> dict[str, FloatArray]:
-        mechanism = self.mechanism
-        own = [element.constants() for element in working_elements(mechanism).values()]
-        if all(own) and not conservative_elements(mechanism):
-            structs = [force_struct(**constants[0]) for constants in own]
-            try:
-                with self._all_rows() as kernel_system:
-                    found = kernel_system.stage_powers(
-                        chosen.tolist(), times, states, rates, A, c, structs
-                    )
-            except ArithmeticError:
-                pass  # the reference raises the error that says why
-            else:
-                return dict(zip(working_elements(mechanism), np.moveaxis(found, 2, 0)))
-        return super().stage_powers(chosen, times, states, rates, A, c)
+        structs = _structs_of_dampers(self.mechanism)
+        if structs is None:
+            return super().stage_powers(chosen, times, states, rates, A, c)
+        try:
+            with self._all_rows() as kernel_system:
+                found = kernel_system.stage_powers(
+                    chosen.tolist(), times, states, rates, A, c, structs
+                )
+        except ArithmeticError:  # the reference raises the error that says why
+            return super().stage_powers(chosen, times, states, rates, A, c)
+        return dict(zip(working_elements(self.mechanism), np.moveaxis(found, 2, 0)))
+
+
+@per_model
+def _structs_of_dampers(mechanism: MechanismData) -> list[Any] | None:
+    """The working elements as the kernel takes them; None if it cannot evaluate all, or their force
+    at rest has a potential."""
+    own = [element.constants() for element in working_elements(mechanism).values()]
+    if not all(own) or conservative_elements(mechanism):
+        return None
+    return [force_struct(**constants[0]) for constants in own]
 
 
 def _loaded(system: OpenSystem | ClosedSystem) -> Observables:

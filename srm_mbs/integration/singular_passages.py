@@ -463,18 +463,20 @@ def _stays_away(scheme: ButcherTableau, steps: StepData) -> bool:
     interval, bounds the lowest sigma of all.  Of one scheme only."""
     if np.logical_or.reduce(steps.stiff):
         return False
-    own, h = scheme.member(False), np.diff(steps.times)
-    sigma = np.empty((steps.count, len(own.distinct) + 1))
-    sigma[:, 1:] = steps.sigmas[:, own.distinct]
-    sigma[0, 0], sigma[1:, 0] = steps.sigmas[0, 0], sigma[:-1, -1]
-    lowest = np.minimum.reduce(sigma, axis=1)
+    own = scheme.member(False)
+    lengths = own.intervals
+    # Samples of one time next to each other: reductions along them take whole vectors.
+    sigma = np.empty((len(lengths) + 1, steps.count))
+    sigma[1:] = steps.sigmas.T[own.distinct]
+    sigma[0, 0], sigma[0, 1:] = steps.sigmas[0, 0], sigma[-1, :-1]
+    lowest = np.minimum.reduce(sigma)
     if not np.minimum.reduce(lowest) >= LINGERING_SIGMA:
         return False
-    lengths = np.diff(own.abscissae[own.distinct], prepend=0.0)
-    slopes = np.maximum.reduce(np.abs(np.diff(sigma, axis=1)) / lengths, axis=1) / h
+    h = steps.times[1:] - steps.times[:-1]
+    slopes = np.maximum.reduce(np.abs(sigma[1:] - sigma[:-1]) / lengths[:, None]) / h
     reach = -(-scheme.n_stages // len(lengths))  # steps within n_stages samples
-    allowed = 0.5 * SLOPE_MARGIN * lengths.max() * h * _largest(slopes, reach, reach)
-    return bool(np.minimum.reduce(lowest - allowed) >= VANISHING_SIGMA * sigma.max())
+    lowest -= 0.5 * SLOPE_MARGIN * max(lengths) * h * _largest(slopes, reach, reach)
+    return bool(np.minimum.reduce(lowest) >= VANISHING_SIGMA * np.maximum.reduce(sigma, axis=None))
 
 
 def _lowest(t: FloatArray, sigma: FloatArray, around: int) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -107,6 +108,22 @@ def test_a_linkage_that_is_only_almost_singular_passes_nothing(longer: float) ->
 )
 def test_regular_motions_list_no_passage(name: str, tableau: str, tol: float) -> None:
     assert run(name, 5.0, tableau, tol).crossings == ()
+
+
+def test_bounds_of_whole_steps_rule_out_passages_only_where_those_of_all_intervals_do() -> None:
+    """sigma of random motions at the stages of a run, with steps of different lengths."""
+    solution, rng = srm.simulate(load("four_bar"), 4.0), np.random.default_rng(3)
+    scheme, outcomes = solution.scheme, set()
+    t = solution.steps.stage_times(scheme)
+    for level in np.linspace(0.1, 1.0, 60):
+        waves = np.sin(np.multiply.outer(rng.uniform(1.0, 20.0, 3), t) + rng.uniform(0.0, 6.0))
+        sigmas = np.abs(level + 0.2 * np.tensordot(rng.uniform(0.0, 1.0, 3), waves, axes=1))
+        steps = replace(solution.steps, sigmas=sigmas)
+        times, recorded = crossings_module._recorded(scheme, steps)
+        lowest = crossings_module._lowest(times, recorded, scheme.n_stages)
+        marked = crossings_module._may_vanish(recorded, lowest, scheme.n_stages).any()
+        outcomes.add((crossings_module._stays_away(scheme, steps), bool(marked)))
+    assert outcomes - {(False, False)} == {(True, False), (False, True)}
 
 
 def test_a_start_on_a_singular_configuration_is_no_passage() -> None:

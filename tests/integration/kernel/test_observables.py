@@ -6,6 +6,7 @@ import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
@@ -120,8 +121,34 @@ def test_closures_on_lie_groups_are_those_of_the_reference() -> None:
     mechanism = dataclasses.replace(ring, model=model)
     t, q, v = states(mechanism)
     compiled, reference = both(mechanism)
+    for found, expected in zip(compiled.closure_errors(t, q, v), reference.closure_errors(t, q, v)):
+        same(found, expected)
     same(compiled.jacobians(t, q), reference.jacobians(t, q))
     same(compiled.energies(q, v), reference.energies(q, v))
+
+
+def test_powers_at_stages_are_those_of_the_states_there() -> None:
+    """On Lie groups; of the reference by its own states, of the kernel in one call."""
+    ring = floating_ring()
+    ends = srm.Anchor(ring.model.names[2], xyz=(0.1, 0.2, 0.3)), srm.Anchor("world")
+    dampers = (srm.SpringDamper(*ends, 30.0, 2.0, 0.2, "strut"),)
+    mechanism = dataclasses.replace(ring, forces=dampers)
+    t, q, v = states(mechanism)
+    steps = np.sort(t), np.hstack([q, v])
+    rates = np.random.default_rng(7).standard_normal((COUNT - 1, 3, 2 * mechanism.model.nv))
+    A, c, chosen = np.array([[0.2, 0.0], [0.3, 0.5]]), np.array([0.2, 0.8]), np.array([1, 4])
+    compiled, reference = both(mechanism)
+    found, expected = (
+        own.stage_powers(chosen, *steps, rates, A, c)["strut"] for own in (compiled, reference)
+    )
+    assert found.shape == (2, 2)
+    same(found, expected)
+    h = steps[0][5] - steps[0][4]
+    moved = 0.3 * rates[4, 0] + 0.5 * rates[4, 1]
+    place = pin.integrate(mechanism.model, q[4], h * moved[: mechanism.model.nv])
+    rate = v[4] + h * moved[mechanism.model.nv :]
+    there = reference.powers(steps[0][4:5] + 0.8 * h, place[None], rate[None])["strut"]
+    same(expected[1, 1:], there)
 
 
 @pytest.mark.parametrize("kind", ELEMENTS)

@@ -4,8 +4,9 @@
 
 Run from a checkout with the compiled kernel; BLAS runs on one thread.  CPU times of the process in
 milliseconds, the least of the repeats, each on a fresh run: other programs only add to them.
-``certify`` is without its two reruns, and includes the passages and the balance where it reads
-them.  ``n_four_bar_N`` is ``srm.n_four_bar(N)``.
+``certify`` is without its two ``reruns``, and includes the passages and the balance where it reads
+them; ``of run`` and ``of runs`` are its parts, in per cent, of the run and of all three runs.
+``n_four_bar_N`` is ``srm.n_four_bar(N)``.
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ def spent(work: Callable[[], Any]) -> float:
     return 1e3 * (time.process_time() - start)
 
 
-def certified(run: srm.Solution) -> float:
-    """CPU time (ms) of ``certify`` without that of its reruns."""
+def certified(run: srm.Solution) -> tuple[float, float]:
+    """CPU times (ms) of ``certify`` without its reruns, and of these."""
     reruns = 0.0
     rerun = error_estimate.rerun
 
@@ -63,7 +64,7 @@ def certified(run: srm.Solution) -> float:
 
     with mock.patch.object(error_estimate, "rerun", timed):
         whole = spent(lambda: srm.certify(run))
-    return whole - reruns
+    return whole - reruns, reruns
 
 
 READINGS: dict[str, Callable[[srm.Solution], Any]] = {
@@ -81,8 +82,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
-    heads = ("run", "certify", *READINGS, "mobility")
-    print(f"{'ms':18s} steps passages" + "".join(f"{head:>10s}" for head in heads))
+    heads = ("run", "reruns", "certify", *READINGS, "mobility")
+    shown = (*heads, "of run", "of runs")
+    print(f"{'ms':18s} steps passages" + "".join(f"{head:>10s}" for head in shown))
     for name in options.models:
         mechanism = mechanism_of(name)
 
@@ -95,11 +97,16 @@ def main() -> None:
             start = time.process_time()
             whole = run()
             rows["run"].append(1e3 * (time.process_time() - start))
-            rows["certify"].append(certified(run()))
+            added, reruns = certified(run())
+            rows["certify"].append(added)
+            rows["reruns"].append(reruns)
             for head, reading in READINGS.items():
                 rows[head].append(spent(lambda: reading(whole)))  # noqa: B023
             rows["mobility"].append(spent(lambda: srm.mobility_map(whole)))  # noqa: B023
-        numbers = "".join(f"{min(rows[head]):10.2f}" for head in heads)
+        least = {head: min(rows[head]) for head in heads}
+        parts = (least["run"], least["run"] + least["reruns"])
+        percents = (1e2 * least["certify"] / part for part in parts)
+        numbers = "".join(f"{value:10.2f}" for value in (*least.values(), *percents))
         print(f"{name:18s} {whole.stats.steps:5d} {len(whole.crossings):8d}{numbers}", flush=True)
 
 

@@ -749,7 +749,7 @@ def statistics(
     """Counts of a run; ``work``: numbers of evaluations and factorisations."""
     return Statistics(
         steps,
-        sum(attempt.decision is StepDecision.REJECTED for attempt in record.attempts),
+        [attempt.decision for attempt in record.attempts].count(StepDecision.REJECTED),
         sum(counter.placed for counter in counters),
         sum(counter.replaced for counter in counters),
         zone_steps,

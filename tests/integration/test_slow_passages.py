@@ -182,6 +182,31 @@ def test_errors_fall_with_the_tolerance_however_far_the_linkage_reaches(
     assert error < 1e-10 + 100.0 * tol
 
 
+FREEDOM = {"driven": (True, False), "driven_and_free": (True, True), "free": (False, True)}
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("freedom", FREEDOM.values(), ids=FREEDOM)
+@pytest.mark.parametrize(
+    ("reach", "tol"),
+    [
+        (0.0, 1e-6),
+        (0.0, 1e-10),
+        *(
+            pytest.param(reach, tol, marks=pytest.mark.stress)
+            for reach in (0.0, 1e-1, 1e-3, 1e-5, 1e-7, -1e-7, -1e-5, -1e-3, -0.1)
+            for tol in (1e-4, 1e-8, 1e-12)
+        ),
+    ],
+)
+def test_errors_fall_where_branches_of_driven_or_freer_linkages_touch(
+    reach: float, tol: float, freedom: tuple[bool, bool], backend: str
+) -> None:
+    motion = tangency.moving(reach, *freedom)
+    solution = srm.simulate(motion.mechanism, motion.t_end, rtol=tol, backend=backend)
+    assert motion.error(solution) < 1e-10 + 100.0 * tol
+
+
 def test_kernel_and_reference_touch_alike() -> None:
     kernel, reference = (touched(0.0, "dop853", 1e-8, backend)[0] for backend in BACKENDS)
     assert kernel.stats.steps == reference.stats.steps

@@ -122,7 +122,8 @@ def test_nodes_solve_where_nothing_can_be_solved_for(angle: float) -> None:
     nodes = BranchNodes(system)
     before = np.concatenate([0.01 * turning.ALIKE, 2.0 * turning.ALIKE])
     away = nodes.find_direction(0.0, before)
-    assert away is not None and len(away) == 1
+    assert away is not None
+    assert len(away) == 1
     exact = np.concatenate([angle * turning.ALIKE, 2.0 * turning.ALIKE])
     off = 1e-6 * np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0])
     assert nodes.solve(0.0, exact + off, away[0])

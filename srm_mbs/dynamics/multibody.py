@@ -191,22 +191,27 @@ class ClosedTerms:
         g[self._loops.driven_rows] -= allowed
         return self._p.unwhiten(self._p.normal(g))
 
-    def branch_tangents(self) -> FloatArray:
-        """M-orthonormal velocities (nv, k) that satisfy the closures, whatever the drives."""
+    def branch_tangents(self) -> tuple[FloatArray, FloatArray]:
+        """M-orthonormal velocities (nv, k) that satisfy the closures, whatever the drives, and the
+        rates (d, k) of the drives along them."""
         p, rows = self._p, self._loops.driven_rows
         units = np.eye(len(self._loops.g))[:, rows]
         driven = np.array([p.normal(unit) for unit in units.T]).reshape(-1, len(self.v))
-        whole = np.linalg.norm(driven, axis=1)
+        free = p.complement()
         own: list[FloatArray] = []
-        for white, size in zip(driven, whole):
+        own_rates: list[FloatArray] = []
+        for white, rates in zip(driven, np.eye(len(driven))):
+            size = np.linalg.norm(white)
             for _ in range(2):
-                for other in own:
-                    white = white - other * (other @ white)
+                for other, its in zip(own, own_rates):
+                    part = other @ white
+                    white, rates = white - part * other, rates - part * its
             left = np.linalg.norm(white)
             if left > DEPENDENT_DRIVE * size:
                 own.append(white / left)
-        white = np.column_stack([p.complement(), *own])
-        return p.unwhiten(white)
+                own_rates.append(rates / left)
+        none = np.zeros((len(driven), free.shape[1]))
+        return p.unwhiten(np.column_stack([free, *own])), np.column_stack([none, *own_rates])
 
     def sweep(self, previous: FloatArray, eps: float) -> tuple[FloatArray, FloatArray]:
         p = self._p

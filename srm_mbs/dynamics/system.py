@@ -297,8 +297,9 @@ class BranchTerms(Terms, Protocol):
     def closing(self, allowed: FloatArray) -> FloatArray:
         """E g (nv,), without ``allowed`` of the rows of the drives."""
 
-    def branch_tangents(self) -> FloatArray:
-        """M-orthonormal velocities (nv, k) that satisfy the closures, whatever the drives."""
+    def branch_tangents(self) -> tuple[FloatArray, FloatArray]:
+        """M-orthonormal velocities (nv, k) that satisfy the closures, whatever the drives, and the
+        rates (d, k) of the drives along them."""
 
 
 class BranchSystem(System, Protocol):

@@ -563,6 +563,7 @@ def start(
     if motion.is_slow(rate) and _uses_nodes(method) and branch_system is not None:
         nodes = BranchNodes(branch_system)
         away = nodes.spaced(t, state, limit.direction[: len(unit)] * unit)
+        away = None if away is None else away[None]
         history, memory.lingering = replace(history, away=away), away is not None
     elif begins or memory.sigma < LARGEST_ZONE_SIGMA:
         try:

@@ -182,6 +182,42 @@ def test_errors_fall_with_the_tolerance_however_far_the_linkage_reaches(
     assert error < 1e-10 + 100.0 * tol
 
 
+FREEDOM = {"driven": (True, False), "driven, free": (True, True), "free": (False, True)}
+REACHES = (0.0, 0.1, 1e-3, 1e-5, 1e-7, -1e-7, -1e-5, -1e-3, -0.1)
+
+
+def touched_otherwise(freedom: str, reach: float, tol: float, backend: str) -> None:
+    motion = tangency.moving(reach, *FREEDOM[freedom])
+    solution = srm.simulate(motion.mechanism, motion.t_end, rtol=tol, backend=backend)
+    assert motion.error(solution) < 1e-10 + 100.0 * tol
+
+
+@pytest.mark.parametrize(
+    ("freedom", "tol", "backend"),
+    [
+        ("driven", 1e-10, "python"),
+        ("driven", 1e-10, "kernel"),
+        ("driven, free", 1e-10, "kernel"),
+        ("free", 1e-10, "kernel"),
+        *(pytest.param(name, 1e-8, "python", marks=pytest.mark.stress) for name in FREEDOM),
+    ],
+)
+def test_branches_of_driven_and_of_freer_linkages_touch(
+    freedom: str, tol: float, backend: str
+) -> None:
+    touched_otherwise(freedom, 0.0, tol, backend)
+
+
+@pytest.mark.stress
+@pytest.mark.parametrize("freedom", FREEDOM)
+@pytest.mark.parametrize("tol", [1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
+@pytest.mark.parametrize("reach", REACHES)
+def test_errors_of_driven_and_of_freer_linkages_fall_with_the_tolerance(
+    reach: float, tol: float, freedom: str
+) -> None:
+    touched_otherwise(freedom, reach, tol, "kernel")
+
+
 def test_kernel_and_reference_touch_alike() -> None:
     kernel, reference = (touched(0.0, "dop853", 1e-8, backend)[0] for backend in BACKENDS)
     assert kernel.stats.steps == reference.stats.steps

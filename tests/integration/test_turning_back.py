@@ -123,9 +123,10 @@ def test_nodes_solve_where_nothing_can_be_solved_for(angle: float) -> None:
     before = np.concatenate([0.01 * turning.ALIKE, 2.0 * turning.ALIKE])
     away = nodes.find_direction(0.0, before)
     assert away is not None
+    assert len(away) == 1
     exact = np.concatenate([angle * turning.ALIKE, 2.0 * turning.ALIKE])
     off = 1e-6 * np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0])
-    assert nodes.solve(0.0, exact + off, away)
+    assert nodes.solve(0.0, exact + off, away[0])
     acceleration = reduced.parallelogram()(0.0, [nodes.state[0], nodes.state[3]])[1]
     np.testing.assert_allclose(nodes.state[:3], nodes.state[0] * turning.ALIKE, atol=1e-13)
     np.testing.assert_allclose(nodes.state[3:], nodes.state[3] * turning.ALIKE, atol=1e-11)

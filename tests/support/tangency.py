@@ -10,12 +10,16 @@ rates.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from tests.support.mechanisms import add_link, along_x, rod
+from tests.support.turning import Motion
 
 G = 9.81
 INPUT, COUPLER, BAR = 0.5, 1.5, 2.0
@@ -128,3 +132,130 @@ def inputs(reach: float, times: np.ndarray, longer: float = 0.0) -> np.ndarray:
     run = solve_ivp(field, (0.0, times[-1]), [FIRST], "DOP853", times, rtol=1e-13, atol=1e-13)
     assert run.success
     return np.asarray(run.y[0])
+
+
+# --- driven, and with a further freedom -----------------------------------------------------------
+
+END = 0.35
+SWING, SWINGING = 1.6, 4.0
+"""Amplitude (rad) and angular frequency (rad/s) of a driven input."""
+PHASE = float(np.arcsin(FIRST / SWING))
+PENDULUM = (-1.0, 2.0)
+"""Absolute angle (rad) and rate (rad/s) of the pendulum at the start."""
+
+
+def _second_rates(psi: float, reach: float) -> np.ndarray:
+    """Second derivatives of coupler and crank by the input."""
+    (coupler, crank), (dcoupler, dcrank) = _angles(psi, reach), _rates(psi, reach)
+    known = INPUT * _along(psi) + COUPLER * dcoupler**2 * _along(coupler)
+    closure = np.column_stack([COUPLER * _across(coupler), -_across(crank)])
+    return np.linalg.solve(closure, known - dcrank**2 * _along(crank))
+
+
+def _input(t: Any) -> tuple[Any, Any, Any]:
+    """Angle, rate and acceleration of a driven input."""
+    phase = SWINGING * t + PHASE
+    speed = SWING * SWINGING
+    return SWING * np.sin(phase), speed * np.cos(phase), -speed * SWINGING * np.sin(phase)
+
+
+def _turning(angle: float, length: float, first: float, second: float) -> np.ndarray:
+    """First and second derivatives (2, 2) of ``length`` along ``angle``."""
+    n = _across(angle)
+    return length * np.array([first * n, second * n - first**2 * _along(angle)])
+
+
+def _bars(psi: float, reach: float) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
+    """Of each bar, first and second derivatives by the input of its centre (2, 2) and of its angle
+    (2,) over that of a unit radius of gyration; of the crank's tip those of its place."""
+    (coupler, crank), (dcoupler, dcrank) = _angles(psi, reach), _rates(psi, reach)
+    ecoupler, ecrank = _second_rates(psi, reach)
+    joint = _turning(psi, INPUT, 1.0, 0.0)
+    tip = _turning(crank, BAR, dcrank, ecrank)
+    bars = [
+        (0.5 * joint, INPUT * np.array([1.0, 0.0])),
+        (
+            joint + 0.5 * _turning(coupler, COUPLER, dcoupler, ecoupler),
+            COUPLER * np.array([dcoupler, ecoupler]),
+        ),
+        (0.5 * tip, BAR * np.array([dcrank, ecrank])),
+        (tip + 0.5 * _turning(-crank, BAR, -dcrank, -ecrank), -BAR * np.array([dcrank, ecrank])),
+    ]
+    return [(centre, turn / np.sqrt(12.0)) for centre, turn in bars], tip
+
+
+def _free(reach: float) -> Any:
+    """(psi, chi, psi', chi') of input and pendulum, by d'Alembert's principle."""
+    weight = np.array([0.0, -G])
+
+    def field(t: float, y: Any) -> list[float]:
+        psi, chi, rate, swing = y
+        bars, tip = _bars(psi, reach)
+        n = _across(chi)
+        mass = sum(c[0] @ c[0] + a[0] * a[0] for c, a in bars) + tip[0] @ tip[0]
+        both = 0.5 * tip[0] @ n
+        force = sum(c[0] @ (weight - c[1] * rate**2) - a[0] * a[1] * rate**2 for c, a in bars)
+        left = weight - tip[1] * rate**2 + 0.5 * swing**2 * _along(chi)
+        matrix = np.array([[mass, both], [both, 1.0 / 3.0]])
+        forces = [force + tip[0] @ left, 0.5 * n @ left]
+        return [rate, swing, *np.linalg.solve(matrix, forces)]
+
+    return field
+
+
+def _carried(reach: float) -> Any:
+    """(chi, chi') of the pendulum on the tip of a crank whose input is driven."""
+
+    def field(t: float, y: Any) -> list[float]:
+        psi, rate, acceleration = _input(t)
+        tip = _bars(float(psi), reach)[1]
+        of_tip = tip[0] * acceleration + tip[1] * rate**2 + np.array([0.0, G])
+        return [y[1], -1.5 * float(of_tip @ _across(y[0]))]
+
+    return field
+
+
+def _solved(field: Any, start: Any, t: Any) -> np.ndarray:
+    run = solve_ivp(field, (0.0, t[-1]), start, "DOP853", t, rtol=3e-14, atol=1e-15)
+    assert run.success
+    return np.asarray(run.y)
+
+
+def moving(reach: float, driven: bool, pendulum: bool) -> Motion:
+    """The linkage with its input driven by a sine or free, with or without a rod of 1 m and 1 kg
+    that swings at the tip of the crank."""
+    own = mechanism(reach)
+    model, joints = own.model.copy(), ["input", "coupler", "crank", "rod"]
+    if pendulum:
+        at = model.getJointId("crank")
+        add_link(model, at, pin.JointModelRZ(), "pendulum", rod(1.0, 1.0), along_x(BAR))
+        joints.append("pendulum")
+    order = [model.joints[model.getJointId(name)].idx_q for name in joints]
+
+    def whole(psi: Any, rate: Any, chi: Any, swing: Any) -> tuple[np.ndarray, np.ndarray]:
+        coupler, crank = np.array([_angles(x, reach) for x in psi]).T
+        dcoupler, dcrank = np.array([_rates(x, reach) for x in psi]).T * rate
+        q, v = np.zeros((2, len(psi), len(order)))
+        angles = [psi, coupler - psi, crank, -2.0 * crank, chi - crank]
+        rates = [rate, dcoupler - rate, dcrank, -2.0 * dcrank, swing - dcrank]
+        for column, angle, own_rate in zip(order, angles, rates):
+            q[:, column], v[:, column] = angle, own_rate
+        return q, v
+
+    def exact(t: Any) -> tuple[np.ndarray, np.ndarray]:
+        if not driven:
+            psi, chi, rate, swing = _solved(
+                _free(reach), [FIRST, PENDULUM[0], RATE, PENDULUM[1]], t
+            )
+            return whole(psi, rate, chi, swing)
+        psi, rate, _ = _input(t)
+        chi, swing = _solved(_carried(reach), PENDULUM, t) if pendulum else (psi, rate)
+        return whole(psi, rate, chi, swing)
+
+    first = float(_input(0.0)[1]) if driven else RATE
+    (q,), (v,) = whole(*np.array([[FIRST], [first], [PENDULUM[0]], [PENDULUM[1]]]))
+    moved = srm.Mechanism(model, own.loops, q0=q, v0=v)
+    if driven:
+        law = srm.Sine(SWING, omega=SWINGING, phase=PHASE)
+        moved = replace(moved, drives=(srm.Drive(law, "input", absolute=True),))
+    return Motion(moved.with_state(q, v), END, exact)

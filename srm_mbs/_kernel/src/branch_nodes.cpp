@@ -59,15 +59,14 @@ void BranchNodes::find_direction(double t, const double* from, std::vector<doubl
     if (system_.rank_deficient() || !(sigma > constants_.known_direction)) return;
     const int tangents = system_.branch_tangents(basis_);
     if (tangents == 0) return;
-    std::vector<double> w(nv_);
+    std::vector<double> w(nv_), slopes(tangents, 1.0);
     for (int j = 0; j < tangents; ++j) {
         const double* f = &basis_[static_cast<std::size_t>(j) * nv_];
-        double steepness = 1.0;
         if (tangents > 1) {
             const double length = constants_.direction_probe * sigma / system_.position_norm(f);
-            steepness = (sigma_at(t, from, f, length) - sigma_at(t, from, f, -length)) / length;
+            slopes[j] = (sigma_at(t, from, f, length) - sigma_at(t, from, f, -length)) / length;
         }
-        add(steepness, f, w.data(), nv_);
+        add(slopes[j], f, w.data(), nv_);
     }
     const double size = system_.position_norm(w.data());
     if (!(size > 0.0)) return;
@@ -81,9 +80,7 @@ void BranchNodes::find_direction(double t, const double* from, std::vector<doubl
         for (double& x : out) x *= spacing;
         return;
     }
-    if (tangents > 1 || system_.driven()) return;
-    out = w;
-    for (double& x : out) x *= constants_.touching;
+    TouchingBranch::frame_at(system_, constants_, t, from, basis_.data(), slopes, out);
 }
 
 // Node k: the point of the branch that is nearest, in the mass metric, to the state moved along

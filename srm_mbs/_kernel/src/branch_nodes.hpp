@@ -16,7 +16,7 @@ public:
     BranchNodes(System& system, const Constants& constants);
 
     // A direction (nv,) of the branch that leads away from the singular configuration, as long as
-    // nodes are apart, or `touching` where branches touch; empty if the state (nx,) does not
+    // nodes are apart, or its frame where branches touch; empty if the state (nx,) does not
     // determine it.
     void find_direction(double t, const double* state, std::vector<double>& away);
     // Moves the state (nx,) onto its branch, and solves for its multiplier; whether it could.

@@ -33,7 +33,6 @@ namespace srm {
     field(double, node_closing)            /* largest first one, over the spacing */               \
     field(double, node_accuracy)           /* last one (units) */                                  \
     field(double, node_misfit)             /* largest relative error of the multiplier */          \
-    field(double, longest_node_spacing)    /* a longer direction says that branches touch */       \
     /* Touching branches: methods/touching_branches.py. */                                         \
     field(double, touching)                /* distance of the first nodes (units), at least */     \
     field(double, touching_farthest)       /* and at most */                                       \
@@ -43,6 +42,7 @@ namespace srm {
     field(double, touching_least)          /* sigma of nodes, at least */                          \
     field(double, touching_sigma)          /* that of the first ones */                            \
     field(double, touching_accuracy)       /* last Newton step of a node (units) */                \
+    field(double, touching_settled)        /* last motion to where the drives are (units) */       \
     field(double, touching_misfit)         /* of the polynomial (units) */                         \
     field(double, touching_residual)       /* closure error of its points (row units) */           \
     field(double, branch_below)            /* sigma below which lingering stages use them */       \

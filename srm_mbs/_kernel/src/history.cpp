@@ -10,7 +10,7 @@ void MultiplierHistory::check() const {
     const std::size_t width = static_cast<std::size_t>(nv);
     expect_size("values", values.size(), times.size() * width);
     if (nv > 0) expect_size("normals", normals.size(), normals.size() / width * width);
-    if (!away.empty()) expect_size("away", away.size(), width);
+    if (nv > 0) expect_size("away", away.size(), away.size() / width * width);
 }
 
 void MultiplierHistory::clear() {

@@ -16,7 +16,8 @@ namespace srm {
     field(double, known_until)                                                            \
     field(double, known_below)                                                            \
     field(std::vector<double>, normals) /* (m, nv), of the weakest row last; or empty */      \
-    /* Direction of the branch that leads away from a singular configuration (nv,); or empty. */ \
+    /* Direction of the branch that leads away from a singular configuration (1, nv), or its */ \
+    /* frame where branches touch (f + 1, nv); or empty. */                                     \
     field(std::vector<double>, away)
 
 class MultiplierHistory {

@@ -363,11 +363,10 @@ bool SplitStep::solve_on_branch(double t, double start, const double* state,
         away_ = memory.history->away;
         const bool known = !away_.empty();
         if (!known) nodes_->find_direction(start, state, away_);
-        touches_ = !away_.empty() &&
-                   system_.position_norm(away_.data()) > constants.longest_node_spacing;
+        touches_ = away_.size() > static_cast<std::size_t>(nv_);
         if (touches_) {
             if (!touching_) touching_.emplace(system_, constants);
-            found = touching_->prepare(start, state, memory.rate.data(), away_);
+            found = touching_->prepare(start, state, away_);
         }
         if (touches_ || !known) system_.evaluate(t, x_.data(), System::ZoneView{});
     }

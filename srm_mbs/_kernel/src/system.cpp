@@ -1120,24 +1120,37 @@ void System::driven_residuals(std::vector<double>& out) const {
     for (std::size_t k = 0; k < out.size(); ++k) out[k] = g_[data_.drives[k].row];
 }
 
-int System::branch_tangents(std::vector<double>& out) const {
+int System::branch_tangents(std::vector<double>& out, std::vector<double>* rates) const {
     const std::size_t free = static_cast<std::size_t>(nv - projection_->rank);
     out.resize((free + data_.drives.size()) * nv);
     projection_->complement(out.data());
     std::size_t count = free;
-    std::vector<double> unit(data_.rows);
-    for (const DrivenRow& drive : data_.drives) {
+    const int d = static_cast<int>(data_.drives.size());
+    std::vector<double> unit(data_.rows), own_rates;
+    std::vector<double>& driven = rates ? *rates : own_rates;
+    driven.assign((free + d) * d, 0.0);
+    for (int k = 0; k < d; ++k) {
+        const DrivenRow& drive = data_.drives[k];
         double* const own = &out[count * nv];
+        double* const its = &driven[count * d];
+        its[k] = 1.0;
         unit[drive.row] = 1.0;
         projection_->normal(unit.data(), own);
         unit[drive.row] = 0.0;
         const double whole = norm(own, nv);
         for (int pass = 0; pass < 2; ++pass)
-            for (std::size_t j = free; j < count; ++j)
-                add(-dot(&out[j * nv], own, nv), &out[j * nv], own, nv);
+            for (std::size_t j = free; j < count; ++j) {
+                const double part = -dot(&out[j * nv], own, nv);
+                add(part, &out[j * nv], own, nv);
+                add(part, &driven[j * d], its, d);
+            }
         const double size = norm(own, nv);
-        if (!(size > 1e-10 * whole)) continue;
+        if (!(size > 1e-10 * whole)) {
+            std::fill(its, its + d, 0.0);
+            continue;
+        }
         for (int i = 0; i < nv; ++i) own[i] /= size;
+        for (int i = 0; i < d; ++i) its[i] /= size;
         ++count;
     }
     for (std::size_t j = 0; j < count; ++j) projection_->unwhiten(&out[j * nv]);

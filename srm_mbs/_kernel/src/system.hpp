@@ -196,7 +196,8 @@ public:
     void closing(const std::vector<double>& allowed, double* out);
     void driven_residuals(std::vector<double>& out) const;
     // M-orthonormal velocities (k, nv) that satisfy the closures, whatever the drives; their number.
-    int branch_tangents(std::vector<double>& out) const;
+    // `rates` (k, drives), if asked for: those of the drives along them.
+    int branch_tangents(std::vector<double>& out, std::vector<double>* rates = nullptr) const;
     // M-orthonormal normals (k, nv) of the rows in use; empty with drives.
     void normals(std::vector<double>& out) const;
 

@@ -83,7 +83,6 @@ def constants() -> Any:
         node_closing=branch_nodes.LARGEST_CLOSING,
         node_accuracy=branch_nodes.CLOSING_ACCURACY,
         node_misfit=branch_nodes.LARGEST_MISFIT,
-        longest_node_spacing=branch_nodes.LONGEST_SPACING,
         touching=touching_branches.TOUCHING,
         touching_farthest=touching_branches.FARTHEST,
         touching_spacing=touching_branches.NODE_SPACING,
@@ -92,6 +91,7 @@ def constants() -> Any:
         touching_least=touching_branches.LEAST_SIGMA,
         touching_sigma=touching_branches.FIRST_NODE_SIGMA,
         touching_accuracy=touching_branches.CLOSING_ACCURACY,
+        touching_settled=touching_branches.SETTLED,
         touching_misfit=touching_branches.LARGEST_MISFIT,
         touching_residual=touching_branches.LARGEST_RESIDUAL,
         branch_below=branch_nodes.BRANCH_SIGMA,
@@ -228,7 +228,7 @@ def history_struct(history: MultiplierHistory) -> Any:
         known_until=history.known_until,
         known_below=history.known_below,
         normals=_NO_NUMBERS if normals is None else np.ascontiguousarray(normals.T),
-        away=_NO_NUMBERS if history.away is None else history.away,
+        away=_NO_NUMBERS if history.away is None else np.ravel(history.away),
     )
 
 
@@ -242,7 +242,7 @@ def history_from(struct: Any) -> MultiplierHistory:
         struct.known_until,
         struct.known_below,
         normals.T if len(normals) else None,
-        struct.away if len(struct.away) else None,
+        struct.away.reshape(-1, nv) if len(struct.away) else None,
     )
 
 

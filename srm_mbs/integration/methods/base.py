@@ -192,8 +192,8 @@ class StepResult:
         Whether a stage lingered next to a singular configuration and was held on its branch.
     normals
         Normals of the closures at an end point next to a singular configuration, else None.
-    away : (nv,) or None
-        Direction of the branch at an end point that its nodes solved.
+    away : (1, nv), (f + 1, nv) or None
+        Direction or frame of the branch at an end point that its nodes solved.
     lost_branch
         Whether nodes of the branch were wanted and not found.
     stiff

@@ -27,7 +27,11 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import BranchSystem
-from srm_mbs.integration.methods.touching_branches import TOUCHING, StageOnBranch, TouchingBranch
+from srm_mbs.integration.methods.touching_branches import (
+    StageOnBranch,
+    TouchingBranch,
+    touching_frame,
+)
 
 BRANCH_SIGMA = 3e-3
 """sigma below which stages of a motion that lingers are solved by nodes."""
@@ -39,8 +43,6 @@ NODE_SPACING = 0.02
 """Distance between nodes (rad, scene diagonals)."""
 SPACING_DOUBLINGS = 2
 """Times that it is doubled, at most, until it suffices."""
-LONGEST_SPACING = 0.09
-"""A longer direction says that branches touch."""
 FIRST_NODE_SIGMA = 0.01
 """sigma of the first nodes for which the spacing suffices.  Where branches touch, sigma grows with
 the square of the distance, and none does.  Every node needs half of it: where another loop is next
@@ -75,29 +77,29 @@ class BranchNodes(StageOnBranch):
         return self._system.evaluate(t, moved).sigma
 
     def find_direction(self, t: float, state: FloatArray) -> FloatArray | None:
-        """A direction (nv,) of the branch that leads away from the singular configuration, as long
-        as nodes are apart, or TOUCHING where branches touch; None if the ``state`` (nx,) does not
-        determine it."""
+        """A direction (1, nv) of the branch that leads away from the singular configuration, as
+        long as nodes are apart, or the frame of the branch (f + 1, nv) where branches touch; None
+        if the ``state`` (nx,) does not determine it."""
         system = self._system
         terms = system.evaluate(t, state)
         sigma = terms.sigma
         if terms.rank_deficient or not sigma > KNOWN_DIRECTION_SIGMA:
             return None
-        tangents, driven = terms.branch_tangents().T, len(terms.driven_residuals()) > 0
+        tangents = terms.branch_tangents()[0].T
         if not len(tangents):
             return None
-        w = np.zeros(system.nv)
-        for f in tangents:
-            steepness = 1.0
-            if len(tangents) > 1:
+        slopes = np.ones(len(tangents))
+        if len(tangents) > 1:
+            for i, f in enumerate(tangents):
                 length = DIRECTION_PROBE * sigma / system.position_norm(f)
                 ahead, behind = (self._sigma_at(t, state, side * f) for side in (length, -length))
-                steepness = (ahead - behind) / length
-            w += steepness * f
-        away = self.spaced(t, state, w)
-        if away is None and len(tangents) == 1 and not driven:
-            return TOUCHING / system.position_norm(w) * w
-        return away
+                slopes[i] = (ahead - behind) / length
+        if not slopes.any():
+            return None
+        away = self.spaced(t, state, slopes @ tangents)
+        if away is None:
+            return touching_frame(system, t, state, tangents, slopes)
+        return away[None]
 
     def spaced(self, t: float, state: FloatArray, w: FloatArray) -> FloatArray | None:
         """The direction w (nv,), as long as nodes are apart; None if no spacing
@@ -157,7 +159,7 @@ class BranchNodes(StageOnBranch):
         closings = np.array([closing for _, closing, _ in found])
         off = np.array([off for *_, off in found])
         self.moved = np.concatenate([-_VALUE @ closings, _VALUE @ off])
-        self.away = away + _SLOPE @ closings
+        self.away = (away + _SLOPE @ closings)[None]
         self.state = system.retract(state, -self.moved)
         free = system.evaluate(t, self.state).free_acceleration()
         multipliers, size = [], 0.0
@@ -180,10 +182,10 @@ class StageNodes(BranchNodes):
     ----------
     system
         The mechanism.
-    t, state, rate
-        Start of the step (s), the state there (nx,) and its tangent rate (2 nv,).
-    direction : (nv,) or None
-        Direction of the branch there; None to find it when a stage needs it.
+    t, state
+        Start of the step (s) and the state there (nx,).
+    direction : (1, nv), (f + 1, nv) or None
+        That of :meth:`find_direction` there; None to find it when a stage needs it.
 
     Attributes
     ----------
@@ -198,11 +200,10 @@ class StageNodes(BranchNodes):
         system: BranchSystem,
         t: float,
         state: FloatArray,
-        rate: FloatArray,
         direction: FloatArray | None,
     ) -> None:
         super().__init__(system)
-        self._start, self._rate, self._direction = (t, state), rate, direction
+        self._start, self._direction = (t, state), direction
         self._touching: TouchingBranch | None = None
         self.used = self.lost = False
 
@@ -214,16 +215,14 @@ class StageNodes(BranchNodes):
             self._direction = self.find_direction(*self._start)
         if self._direction is None:
             solved = False
-        elif self._system.position_norm(self._direction) > LONGEST_SPACING:
+        elif len(self._direction) > 1:
             solved = self._solve_touching(t, state, self._direction)
         else:
-            solved = self.solve(t, state, self._direction)
+            solved = self.solve(t, state, self._direction[0])
         self.used, self.lost = self.used or solved, not solved
         return solved
 
     def _solve_touching(self, t: float, state: FloatArray, direction: FloatArray) -> bool:
         if self._touching is None:
-            self._touching = TouchingBranch(self._system)
-            if not self._touching.prepare(*self._start, self._rate, direction):
-                return False
+            self._touching = TouchingBranch(self._system, *self._start, direction)
         return self._touching.solve(t, state, self)

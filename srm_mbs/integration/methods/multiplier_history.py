@@ -35,8 +35,8 @@ class MultiplierHistory:
     normals
         Of the last node, if it lies next to a singular configuration; see
         :class:`~srm_mbs.dynamics.system.Zone`.
-    away : (nv,) or None
-        Direction of the branch at the last node, if nodes of the branch solved it; see
+    away : (1, nv), (f + 1, nv) or None
+        Direction or frame of the branch at the last node, if nodes of the branch solved it; see
         :mod:`~srm_mbs.integration.methods.branch_nodes`.
     """
 

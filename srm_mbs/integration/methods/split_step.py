@@ -144,7 +144,7 @@ class SplitStep:
             weights = norm.weights(memory.state_scale)
             branch_system = system.branch_system
             if memory.lingering and self.uses_nodes and branch_system is not None:
-                nodes = StageNodes(branch_system, t, state, memory.rate, history.away)
+                nodes = StageNodes(branch_system, t, state, history.away)
             lingers = nodes is not None
             branch = BranchStages(
                 system, memory, norm, weights, h, sigma_change, history, t + h, lingering=lingers

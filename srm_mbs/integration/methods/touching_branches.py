@@ -2,30 +2,39 @@ r"""The motion next to a singular configuration where branches touch instead of 
 
 There sigma grows with the square of the distance, and P in the mass metric may turn within less
 than the distance at which closures can be solved for: nodes for P
-(:mod:`srm_mbs.integration.methods.branch_nodes`) would have to be too far apart.  With one degree
-of freedom the branch itself is smooth beyond that.  *Nodes* q_k on both sides, with
-g(q_k) = 0, give it as a polynomial,
+(:mod:`srm_mbs.integration.methods.branch_nodes`) would have to be too far apart.  The branch itself
+is smooth beyond that.  Let W (nv, f) be a basis of its velocities, whatever the drives, where the
+step begins, its first column the direction w in which sigma changes most, and p (nv, f) the dual
+basis, p^T W = 1.  *Nodes* q_k on both sides, at p^T (q_k (-) q_n) = (x_k, z), with closed loops,
+are the same distance z along the other velocities as the stage that they solve, and
 
-    q(y) = q (+) delta(y),   delta(y_k) = q_k (-) q,   y = p . delta,
+    T_k,   G T_k = 0,   p^T T_k = 1,
 
-p the direction in which the step begins, in units.  A stage (q, v) is moved to the point with
-y = 0, and with q' and q'' there
+is smooth on the branch.  Polynomials through all nodes give the place q of the stage, the curve
+through it with its derivatives q' and q'', and T; with drives, whose rates are D = (d rates) T,
+the stage moves on the branch to where they are.  Then
 
-    v_on = s q',   s = q' . M v / m,   m = q' . M q',
-    v' = q' s' + q'' s^2,   s' = q' . M (a - q'' s^2) / m,   a = M^-1 f at (q_on, v_on),
+    v_on = T s,   v' = T s' + b,   b = dT/dt s,   D s = the rates of the drives,
+    T^T M (v_on - v) = D^T mu,   T^T M (v' - M^-1 f) = D^T nu,
 
-because the closures do no work.  The first guess of a node is on the parabola that the motion
-follows where the step begins: both branches have its tangent, and only one its curvature.
+because closures do no work.  The part of b along the curve is that of q''; with f > 1 the rest is
+interpolated from the nodes, b_k = -E (Gdot v_k) + T_k p^T E (Gdot v_k), v_k = T_k s.  Columns of T
+but the first, along which sigma does not change, have little to do with the loop that is singular,
+so that the rounding of E, which grows like 1/sigma, does not enter.
+
+The first guess of a node is on the parabola that the branch follows where the step begins: both
+branches have its tangent, and only one its curvature.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.system import BranchSystem
+from srm_mbs.dynamics.system import BranchSystem, BranchTerms
 
 TOUCHING = 0.1
 """Distance (rad, scene diagonals) of the first nodes from the middle between them, at least.  A
@@ -48,6 +57,8 @@ LARGEST_CLOSING = 0.5
 """The first of them, over NODE_SPACING: beyond it lies the other branch."""
 CLOSING_ACCURACY = 1e-10
 """The last of them (rad, scene diagonals): the next one would be rounding."""
+SETTLED = 1e-13
+"""The last motion (rad, scene diagonals) along the branch to where its drives are."""
 LARGEST_MISFIT = 1e-10
 """Largest distance of the polynomial from that without the outermost nodes."""
 LARGEST_RESIDUAL = 1e-13
@@ -78,8 +89,8 @@ class StageOnBranch:
         The stage on its branch, its tangent rate and its multiplier.
     moved : (2 nv,)
         What was subtracted from the stage.
-    away : (nv,)
-        The direction of the branch there, as long as nodes are apart, or TOUCHING.
+    away : (1, nv) or (f + 1, nv)
+        The direction of the branch there, as long as nodes are apart, or its frame.
     """
 
     state: FloatArray
@@ -89,59 +100,97 @@ class StageOnBranch:
     away: FloatArray
 
 
+@dataclass(frozen=True)
+class Node:
+    """A closed configuration.
+
+    Attributes
+    ----------
+    off, motion : (nv,)
+        Motions to it from the parabola, and from the start of the step.
+    tangents : (nv, f)
+        Velocities that satisfy the closures, whatever the drives, with unit rates.
+    driven : (d, f)
+        Rates of the drives along them.
+    residuals : (d,)
+        Those of the drives.
+    """
+
+    off: FloatArray
+    motion: FloatArray
+    tangents: FloatArray
+    driven: FloatArray
+    residuals: FloatArray
+
+
+def touching_frame(
+    system: BranchSystem, t: float, state: FloatArray, tangents: FloatArray, slopes: FloatArray
+) -> FloatArray:
+    """The frame (f + 1, nv) of a branch at a ``state`` (nx,) where it has ``tangents`` (f, nv) with
+    ``slopes`` (f,) of sigma: the direction in which that changes most, TOUCHING long, f - 1 in
+    which it does not change, and half the curvature of the branch along the first."""
+    steepest = int(np.argmax(np.abs(slopes)))
+    others = tangents - np.outer(slopes / slopes[steepest], tangents[steepest])
+    w = slopes @ tangents
+    w = w / system.position_norm(w)
+    moving = state.copy()
+    moving[-system.nv :] = w
+    bend = -0.5 * system.evaluate(t, moving).multiplier_of(np.zeros(system.nv))
+    frame: FloatArray = np.vstack([TOUCHING * w, np.delete(others, steepest, axis=0), bend])
+    return frame
+
+
 class TouchingBranch:
-    """Solves the stages of one step by the nodes of their branch."""
+    """Solves the stages of one step by the nodes of their branch.
 
-    def __init__(self, system: BranchSystem) -> None:
-        self._system = system
-        self._nodes: list[FloatArray] = []
+    Parameters
+    ----------
+    system
+        The mechanism.
+    t, state
+        Start of the step (s), the state there (nx,).
+    frame : (f + 1, nv)
+        That of :func:`touching_frame` there.
+    """
 
-    def prepare(self, t: float, state: FloatArray, rate: FloatArray, w: FloatArray) -> bool:
-        """Find the nodes for a step from ``state`` (nx,) at t (s) with the tangent ``rate``
-        (2 nv,), in the direction w (nv,); whether there are any."""
-        system, nv = self._system, self._system.nv
-        w = w / system.position_norm(w)
-        self._along = w / system.singularities.coordinate_unit**2
-        self._along /= self._along @ w
-        v, a = rate[:nv], rate[nv:]
-        speed = float(self._along @ v)
-        if not abs(speed) > 0.0:
-            return False
-        bend = 0.5 * (a - v * (float(self._along @ a) / speed)) / speed**2
-        self._parabola = state, w, bend
+    def __init__(
+        self, system: BranchSystem, t: float, state: FloatArray, frame: FloatArray
+    ) -> None:
+        self._system, self._start = system, state
+        unit = system.singularities.coordinate_unit
+        tangents = frame[:-1] / np.array([[system.position_norm(row)] for row in frame[:-1]])
+        scaled = tangents / unit**2
+        self._tangents, self._along = tangents, np.linalg.solve(scaled @ tangents.T, scaled)
+        self._bend = frame[-1] - (self._along @ frame[-1]) @ tangents
+        self._none = np.zeros(system.nv)
+        self._beside = np.zeros(0)
+        self.nodes: list[Node] = []
+        self._places = np.zeros(0)
         bounds = self._bounds(t)
         if bounds is None:
-            return False
+            return
         centre, reach = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
         if reach > FARTHEST:
-            return False
-        reach = max(TOUCHING, reach)
-        sides: list[list[FloatArray]] = [[], []]
-        for sign, found in zip((-1.0, 1.0), sides):
-            off = np.zeros(nv)
-            for k in range(EACH_SIDE):
-                x = centre + sign * (reach + k * NODE_SPACING)
-                closed = self._closed(t, x, off)
-                if closed is None:
-                    return False
-                off = closed
-                found.append(self._place(x, off))
-        self._nodes = [node for pair in zip(*sides) for node in pair]
-        return True
+            return
+        distances = max(TOUCHING, reach) + NODE_SPACING * np.arange(EACH_SIDE)
+        self._places = centre + np.column_stack([-distances, distances]).ravel()
 
     def _place(self, x: float, off: FloatArray) -> FloatArray:
-        """The state at x on the parabola, moved by ``off`` (nv,)."""
-        state, w, bend = self._parabola
-        return self._system.retract(
-            state, np.concatenate([x * w + x**2 * bend + off, np.zeros_like(off)])
-        )
+        """The motion (nv,) from the start to x on the parabola, moved by ``off`` (nv,)."""
+        out: FloatArray = x * self._tangents[0] + x**2 * self._bend + off
+        return out + self._beside @ self._tangents[1:] if len(self._beside) else out
+
+    def _moved(self, motion: FloatArray, v: FloatArray) -> FloatArray:
+        state = self._system.retract(self._start, np.concatenate([motion, self._none]))
+        state[-len(v) :] = v
+        return state
 
     def _bounds(self, t: float) -> tuple[float, float] | None:
         """The ends of the part around the lowest sigma where it is below that of the first
         nodes; None if it is too long."""
         x = NODE_SPACING * np.arange(-SAMPLES, SAMPLES + 1)
-        none = np.zeros(self._system.nv)
-        roots = np.sqrt([self._system.evaluate(t, self._place(at, none)).sigma for at in x])
+        places = [self._moved(self._place(at, self._none), self._none) for at in x.tolist()]
+        roots = np.sqrt([self._system.evaluate(t, place).sigma for place in places])
         least = math.sqrt(FIRST_NODE_SIGMA)
         lowest = int(roots.argmin())
         ends = []
@@ -155,58 +204,167 @@ class TouchingBranch:
             ends.append(float(x[k] + side * part * NODE_SPACING))
         return ends[0], ends[1]
 
-    def _closed(self, t: float, x: float, off: FloatArray) -> FloatArray | None:
-        """The motion (nv,) from the parabola at x onto the branch, from that of the node before;
-        None if Newton's method does not find it."""
+    def _node(self, t: float, x: float, off: FloatArray) -> Node | None:
+        """The node at x, by Newton's method from the parabola moved by ``off`` (nv,); None if it
+        does not find it."""
         system, last = self._system, np.inf
         for iteration in range(MAX_CLOSINGS):
-            terms = system.evaluate(t, self._place(x, off))
+            motion = self._place(x, off)
+            terms = system.evaluate(t, self._moved(motion, self._none))
             if terms.rank_deficient or not terms.sigma > LEAST_SIGMA:
                 return None
-            closing = terms.correction()[: system.nv]
-            off = off - closing
+            residuals = terms.driven_residuals()
+            closing = terms.closing(residuals)
+            basis, driven = terms.branch_tangents()
+            if basis.shape[1] != len(self._along):
+                return None
+            inverse = np.linalg.inv(self._along @ basis)
+            tangents, driven = basis @ inverse, driven @ inverse
+            closing = closing - tangents @ (self._along @ closing)
             change = system.position_norm(closing)
+            off = off - closing
             if iteration == 0 and change > LARGEST_CLOSING * NODE_SPACING:
                 return None
             if change < CLOSING_ACCURACY:
-                return off
+                return Node(off, self._place(x, off), tangents, driven, residuals)
             if iteration > 1 and not change < last:
                 return None
             last = change
         return None
 
-    def _seen_from(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Places (k,) of the nodes, and the motions (k, nv) to them."""
-        nv = self._system.nv
-        motions = np.array([self._system.difference(state, node)[:nv] for node in self._nodes])
-        return motions @ self._along, motions
+    def _follow(self, t: float, beside: FloatArray) -> bool:
+        """Find the nodes ``beside`` (f - 1,) the step's start; whether there are any."""
+        if self.nodes and np.array_equal(beside, self._beside):
+            return True
+        self._beside = beside
+        known, self.nodes = self.nodes, []
+        for k, x in enumerate(self._places.tolist()):
+            off = known[k].off if known else self.nodes[k - 2].off if k > 1 else self._none
+            node = self._node(t, x, off)
+            if node is None:
+                return False
+            self.nodes.append(node)
+        return len(self.nodes) > 0
+
+    def _settled(self, t: float, z: FloatArray) -> FloatArray | None:
+        """The point (nx,) of the branch where the drives have the rates z (f,); None if there is
+        none."""
+        system = self._system
+        for _ in range(MAX_CLOSINGS):
+            if not self._follow(t, z[1:]):
+                return None
+            value = polynomial_weights(self._places - z[0])[0]
+            motions = np.array([node.motion for node in self.nodes])
+            misfit = polynomial_weights(self._places[:-2] - z[0])[0] @ motions[:-2]
+            misfit -= value @ motions
+            if system.position_norm(misfit) > LARGEST_MISFIT:
+                return None
+            on = self._moved(value @ motions, self._none)
+            terms = system.evaluate(t, on)
+            residuals = terms.driven_residuals()
+            shift = np.zeros(len(z))
+            if len(residuals):
+                tangents, driven = self._mean(value)
+                found = _shared(terms, tangents, driven, shift, -residuals)
+                if found is None:
+                    return None
+                shift = found
+            if system.position_norm(shift @ self._tangents) < SETTLED:
+                return on if terms.constraint_residual() <= LARGEST_RESIDUAL else None
+            z = z + shift
+        return None
+
+    def _mean(self, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Tangents (nv, f) and rates of the drives along them (d, f), with ``weights`` (k,)."""
+        tangents = sum(w * node.tangents for w, node in zip(weights.tolist(), self.nodes))
+        return tangents, sum(w * node.driven for w, node in zip(weights.tolist(), self.nodes))
+
+    def _targets(self, t: float) -> tuple[FloatArray, FloatArray]:
+        """Rates and accelerations (d,) of the drives at t (s)."""
+        node, nv = self.nodes[-1], len(self._none)
+        terms = self._system.evaluate(t, self._moved(node.motion, self._none))
+        seen = np.array([terms.correction()[nv:], terms.multiplier_of(self._none)])
+        rates, accelerations = -seen @ self._along.T @ node.driven.T
+        return rates, accelerations
+
+    def _curvature(self, t: float, node: Node, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Accelerations (nv,), and those of the drives (d,) but for their own, of a motion through
+        ``node`` whose rates s (f,) are constant."""
+        terms = self._system.evaluate(t, self._moved(node.motion, node.tangents @ s))
+        multiplier = terms.multiplier_of(self._none)
+        part = self._along @ multiplier
+        return node.tangents @ part - multiplier, node.driven @ part
 
     def solve(self, t: float, state: FloatArray, stage: StageOnBranch) -> bool:
         """Solve the stage ``state`` (nx,) at t (s) as ``stage``; whether it could be solved."""
-        system, nv = self._system, self._system.nv
-        places, motions = self._seen_from(state)
-        delta = np.zeros(2 * nv)
-        delta[:nv] = polynomial_weights(places)[0] @ motions
-        on = system.retract(state, delta)
+        system, nv, along = self._system, self._system.nv, self._along
+        if not len(self._places):
+            return False
+        on = self._settled(t, along @ system.difference(self._start, state)[:nv])
+        if on is None:
+            return False
         # In the chart at a point of the branch, derivatives are those of the motion.
-        places, motions = self._seen_from(on)
-        _, tangent, bend = polynomial_weights(places) @ motions
-        coarse = polynomial_weights(places[:-2])[0] @ motions[:-2]
-        if system.position_norm(coarse) > LARGEST_MISFIT:
-            return False
+        motions = np.array(
+            [
+                system.difference(on, self._moved(node.motion, self._none))[:nv]
+                for node in self.nodes
+            ]
+        )
+        weights = polynomial_weights(motions @ along[0])
+        tangents, driven = self._mean(weights[0])
+        residuals = np.array([node.residuals for node in self.nodes])
+        _, tangent, bend = weights @ motions
+        _, drive_rate, drift = weights @ residuals
+        rates, further = along @ tangent, along @ bend
+        tangents[:, 0] = (tangent - tangents[:, 1:] @ rates[1:]) / rates[0]
+        driven[:, 0] = (drive_rate - driven[:, 1:] @ rates[1:]) / rates[0]
+        bend, drift = bend - tangents @ further, drift - driven @ further
+        targets, accelerations = self._targets(t) if len(driven) else (self._none[:0],) * 2
         terms = system.evaluate(t, on)
-        if terms.constraint_residual() > LARGEST_RESIDUAL:
+        s = _shared(terms, tangents, driven, terms.momentum(state[-nv:]) @ tangents, targets)
+        if s is None:
             return False
-        momentum = terms.momentum(tangent)
-        inertia = float(momentum @ tangent)
-        s = float(momentum @ state[-nv:]) / inertia
-        on[-nv:] = s * tangent
-        free = system.evaluate(t, on).free_acceleration()
-        across = s**2 * bend
-        acceleration = tangent * (float(momentum @ (free - across)) / inertia) + across
+        part = s[0] / rates[0]
+        bend, drift = part**2 * bend, part**2 * drift
+        if len(s) > 1:
+            for w, node in zip(weights[0].tolist(), self.nodes):
+                for sign, own in ((1.0, s), (-1.0, part * rates)):
+                    more, of_drives = self._curvature(t, node, own)
+                    bend, drift = bend + sign * w * more, drift + sign * w * of_drives
+        on[-nv:] = tangents @ s
+        terms = system.evaluate(t, on)
+        free = terms.free_acceleration()
+        momentum = terms.momentum(free - bend) @ tangents
+        change = _shared(terms, tangents, driven, momentum, accelerations - drift)
+        if change is None:
+            return False
+        acceleration = tangents @ change + bend
         stage.state, stage.multiplier = on, free - acceleration
         stage.rate = np.concatenate([on[-nv:], acceleration])
-        stage.moved = -delta
+        stage.moved = -system.difference(state, on)
         stage.moved[nv:] = state[-nv:] - on[-nv:]
-        stage.away = TOUCHING / system.position_norm(tangent) * tangent
+        size = system.position_norm(tangents[:, 0])
+        curvature = 0.5 * (weights[2] @ motions) / size**2
+        stage.away = np.vstack([TOUCHING / size * tangents[:, 0], tangents.T[1:], curvature])
         return True
+
+
+def _shared(
+    terms: BranchTerms,
+    tangents: FloatArray,
+    driven: FloatArray,
+    momentum: FloatArray,
+    targets: FloatArray,
+) -> FloatArray | None:
+    """The rates (f,) along ``tangents`` (nv, f) with the ``momentum`` (f,) along them and the rates
+    ``targets`` (d,) of the drives; None if these do not determine each other."""
+    f, d = len(momentum), len(targets)
+    if d > f:
+        return None
+    whole = np.zeros((f + d, f + d))
+    whole[:f, :f] = tangents.T @ np.array([terms.momentum(row) for row in tangents.T]).T
+    whole[:f, f:], whole[f:, :f] = driven.T, driven
+    try:
+        return np.linalg.solve(whole, np.concatenate([momentum, targets]))[:f]
+    except np.linalg.LinAlgError:
+        return None

@@ -1,15 +1,15 @@
-"""Expressions of one function, recorded once and written as straight-line C.
+"""Expressions of one function, recorded once.
 
 A :class:`Recorder` makes the leaves: constants, parameters, and what is known at an evaluation
 only.  Arithmetic on an :class:`Expression` records a node: constants fold, zeros and units drop
-out, and the same operation on the same operands is the same node.  Nodes that depend on parameters
-alone are computed once per mechanism; :func:`write_c` writes them into a function of their own.
+out, and the same operation on the same operands is the same node.
+:mod:`srm_mbs.integration.generated.writing` writes them as C.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple, Union
 
 CONSTANT, PARAMETER, VARIABLE = range(3)
@@ -211,43 +211,20 @@ class Recorder:
 
 
 class Output(NamedTuple):
-    """A result of the function: C assigns ``value`` to ``target``."""
+    """A result of the function: C assigns ``value`` to ``target``, for the cell of this number
+    (:mod:`srm_mbs.integration.generated.cells`) or, if it is -1, for none."""
 
     target: str
     value: Expression
+    cell: int = -1
 
 
 class Guard(NamedTuple):
-    """The function returns 1 where ``value`` is below ``bound``."""
+    """The function returns 1 where ``value`` is below ``bound``; the cell is that of an output."""
 
     value: Expression
     bound: Expression
-
-
-class Written(NamedTuple):
-    """The bodies of two C functions.
-
-    Attributes
-    ----------
-    constants
-        Assigns to k[0], k[1], ... what depends on parameters alone.
-    terms
-        Assigns to the outputs; reads k.
-    constant_count
-        Length of k.
-    operations
-        Statements of ``terms``.
-    """
-
-    constants: str
-    terms: str
-    constant_count: int
-    operations: int
-
-
-_INFIX = frozenset("+-*/")
-TURNED_TOGETHER = 4
-"""Angles of which one call computes sines and cosines: lanes of a vector."""
+    cell: int = -1
 
 
 def live_nodes(roots: Iterable[Expression], done: set[int] | None = None) -> list[Expression]:
@@ -267,110 +244,3 @@ def live_nodes(roots: Iterable[Expression], done: set[int] | None = None) -> lis
             stack.append((node, True))
             stack.extend((operand, False) for operand in reversed(node.operands))
     return out
-
-
-def _literal(value: float) -> str:
-    return f"({value!r})" if value < 0.0 else repr(value)
-
-
-class _Names:
-    """How C reads each node."""
-
-    def __init__(self) -> None:
-        self._names: dict[int, str] = {}
-
-    def give(self, node: Expression, name: str) -> None:
-        self._names[node.number] = name
-
-    def of(self, node: Expression) -> str:
-        if node.operation == "constant":
-            return _literal(node.value)
-        return self._names.get(node.number, node.text)
-
-    def operation(self, node: Expression) -> str:
-        """The operation of ``node`` in C."""
-        if not node.operands:
-            return node.text
-        names = [self.of(operand) for operand in node.operands]
-        if node.operation in _INFIX:
-            return f"{names[0]} {node.operation} {names[1]}"
-        if node.operation == "negate":
-            return f"-{names[0]}"
-        if node.operation == "choose":
-            return f"{names[0]} != 0.0 ? {names[1]} : {names[2]}"
-        return f"{node.operation}({', '.join(names)})"
-
-
-def _turn_together(live: Sequence[Expression], names: _Names) -> tuple[list[str], set[int]]:
-    """Statements with the sines and cosines of leaves, of several at a time, and their nodes."""
-    turning = [node for node in live if node.operation in ("sin", "cos")]
-    turning = [node for node in turning if node.operands[0].operation == "leaf"]
-    places = {
-        number: place for place, number in enumerate({n.operands[0].number: 0 for n in turning})
-    }
-    if len(places) < 2:
-        return [], set()
-    angles = ["0.0"] * (-(-len(places) // TURNED_TOGETHER) * TURNED_TOGETHER)
-    for node in turning:
-        place = places[node.operands[0].number]
-        angles[place] = node.operands[0].text
-        block, lane = divmod(place, TURNED_TOGETHER)
-        names.give(node, f"{node.operation}s{block}[{lane}]")
-    statements = []
-    for block in range(len(angles) // TURNED_TOGETHER):
-        first = block * TURNED_TOGETHER
-        given = ", ".join(angles[first : first + TURNED_TOGETHER])
-        statements.append(f"  angles sins{block}, coss{block};")
-        statements.append(f"  turn_all(&(angles){{{given}}}, &sins{block}, &coss{block});")
-    return statements, {node.number for node in turning}
-
-
-def write_c(outputs: Sequence[Output], guards: Sequence[Guard] = ()) -> Written:
-    """``outputs`` as C, in static single assignment, where all ``guards`` hold.
-
-    It calls ``turn_all`` of :mod:`srm_mbs.integration.generated.source`.
-    """
-    roots = [node for guard in guards for node in guard] + [out.value for out in outputs]
-    live = live_nodes(roots)
-    read = [o for node in live if node.depends == VARIABLE for o in node.operands] + roots
-    # Parameters and what depends on them alone, as far as the terms read it, in their order.
-    places: dict[int, int] = {}
-    for node in read:
-        if node.depends == PARAMETER:
-            places.setdefault(node.number, len(places))
-    names = _Names()
-    constants = []
-    for node in live:
-        if node.depends != PARAMETER:
-            continue
-        place = places.get(node.number)
-        if place is not None:
-            constants.append(f"  k[{place}] = {names.operation(node)};")
-        elif node.operands:
-            constants.append(f"  const double c{node.number} = {names.operation(node)};")
-        names.give(node, node.text or f"c{node.number}" if place is None else f"k[{place}]")
-    terms, done = _turn_together(live, names)
-    count = len(outputs)
-
-    def evaluate(root: Expression) -> str:
-        nonlocal count
-        for node in live_nodes((root,), done):
-            if node.depends == VARIABLE and node.operands:
-                terms.append(f"  const double x{node.number} = {names.operation(node)};")
-                names.give(node, f"x{node.number}")
-                count += 1
-        return names.of(root)
-
-    def check(guard: Guard) -> None:
-        value, bound = evaluate(guard.value), evaluate(guard.bound)
-        terms.append(f"  if ({value} < {bound}) return 1;")
-
-    def assign(out: Output) -> None:
-        value = evaluate(out.value)
-        terms.append(f"  {out.target} = {value};")
-
-    for guard in guards:
-        check(guard)
-    for out in outputs:
-        assign(out)
-    return Written("\n".join(constants), "\n".join(terms), len(places), count)

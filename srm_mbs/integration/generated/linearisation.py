@@ -20,6 +20,7 @@ w the spin of a against b in the axes of b (:mod:`srm_mbs.dynamics.forces`).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from srm_mbs.integration.generated.differentiation import (
@@ -27,7 +28,7 @@ from srm_mbs.integration.generated.differentiation import (
     count_derivatives,
     derivatives,
 )
-from srm_mbs.integration.generated.expressions import Expression, Output, write_c
+from srm_mbs.integration.generated.expressions import Expression, Output
 from srm_mbs.integration.generated.structure import COUPLING, ZERO, Bushing, Structure
 from srm_mbs.integration.generated.terms import Row, Trace
 from srm_mbs.integration.generated.vectors import (
@@ -40,6 +41,7 @@ from srm_mbs.integration.generated.vectors import (
     times,
     transposed,
 )
+from srm_mbs.integration.generated.writing import write_c
 
 MOST_STATEMENTS = 8000
 """Statements of derivatives, as :func:`count_derivatives` estimates them, up to which they are
@@ -60,7 +62,7 @@ class _Residual(Trace):
         self.laws: Row = {}
         self.along_q, self.along_v = self.directions()
 
-    def acting(self, law: int, value: Expression) -> Expression:
+    def acting(self, law: int, value: Expression, rates: Iterable[int]) -> Expression:
         """See :class:`Trace`."""
         self.laws[law] = value
         return self.applied[law]
@@ -112,7 +114,7 @@ class _Residual(Trace):
         for i, law in enumerate(bushing.held):
             if law >= 0:
                 value = numbers[i] * stretches[i] + numbers[6 + i] * rates[i]
-                acting[i] = self.acting(law, value)
+                acting[i] = self.acting(law, value, bushing.columns)
         for j, factor in zip(bushing.columns, factors):
             change = turned(times(inverse, scaled(factor, columns[j].angular)), -1.0)
             by_square = sum((u * du for u, du in zip(phi, change)), zero)

@@ -49,6 +49,8 @@ PAIR_SECONDS = 1.2e-8
 STATEMENTS_GUESSED = 120
 """Statements for each coordinate, until they are counted: 60 to 120 in planar chains of loops, 300
 in parallel robots.  Too low a guess costs another generation, too high a one a late compilation."""
+MOST_GUESSED = 10_000
+"""Statements that are guessed at most: long chains of equal loops have fewer."""
 
 
 def compile_seconds(statements: int) -> float:
@@ -70,7 +72,7 @@ class _Account:
 
     def __init__(self, coordinates: int) -> None:
         self.used = 0.0
-        self.needed = compile_seconds(STATEMENTS_GUESSED * coordinates)
+        self.needed = compile_seconds(min(STATEMENTS_GUESSED * coordinates, MOST_GUESSED))
 
 
 class _Use:

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from srm_mbs.integration.generated.algebra import algebra_of
-from srm_mbs.integration.generated.expressions import write_c
 from srm_mbs.integration.generated.linearisation import linearisation_of
 from srm_mbs.integration.generated.structure import Structure
 from srm_mbs.integration.generated.terms import record_terms
+from srm_mbs.integration.generated.writing import write_c
 
 ABI = 3
 """Version of the functions that the kernel calls: ``interface_version`` in generated.cpp."""

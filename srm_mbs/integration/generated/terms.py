@@ -23,7 +23,8 @@ algebra.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from srm_mbs.integration.generated.differentiation import Direction
@@ -172,6 +173,10 @@ class Trace:
         self.guards: list[Guard] = []
         self.outputs: list[Output] = []
         self.bodies: list[Body] = []
+        self.roots: list[int] = []
+        """Of each motion, the first one of its subtree on the ground: the number of its cell."""
+        self.cells: dict[int, int] = {}
+        """Those of the rates."""
         self.columns: list[list[Column]] = []
         """Of each motion, its own."""
 
@@ -191,6 +196,11 @@ class Trace:
         """The body of a joint of the model."""
         number = self.structure.bodies[joint]
         return self.ground if number < 0 else self.bodies[number]
+
+    def cell_of(self, rates: Iterable[int]) -> int:
+        """The cell that most of the rates belong to; -1 without any."""
+        found = Counter(self.cells[j] for j in rates).most_common(1)
+        return found[0][0] if found else -1
 
     def directions(self) -> tuple[list[Direction], list[Direction]]:
         """Rates of change of q and v along each of their tangent coordinates.
@@ -298,6 +308,7 @@ class Trace:
     def _move(self, motion: Motion) -> None:
         """Append the body of ``motion`` and its columns."""
         parent = self.ground if motion.parent < 0 else self.bodies[motion.parent]
+        self.roots.append(len(self.roots) if motion.parent < 0 else self.roots[motion.parent])
         placed, at = self.placement(motion.placement)
         turned, moved, subspace = self._joint(motion)
         before = product(parent.rotation, placed)
@@ -324,6 +335,7 @@ class Trace:
         gradient = gradient_of(spin, spin_bias)
         self.bodies.append(Body(rotation, origin, velocity, spin, bias, spin_bias, gradient))
         self.columns.append(own)
+        self.cells |= dict.fromkeys((column.in_v for column in own), self.roots[-1])
 
     # -- inertia
 
@@ -350,7 +362,8 @@ class Trace:
         """Kinematics, and the outputs M and nle."""
         self.move()
         self._mass_matrix()
-        self.outputs += [Output(f"nle[{i}]", x) for i, x in enumerate(self.inverse_dynamics())]
+        for i, value in enumerate(self.inverse_dynamics()):
+            self.outputs.append(Output(f"nle[{i}]", value, self.cell_of([i])))
 
     def move(self) -> None:
         """Bodies, their columns and their inertias."""
@@ -400,7 +413,8 @@ class Trace:
                 value = dot(other.linear, force) + dot(other.angular, moment)
                 if other.in_v == column.in_v:
                     value = value + armature[column.in_v]
-                self.outputs.append(Output(f"M[{column.in_v * nv + other.in_v}]", value))
+                target = f"M[{column.in_v * nv + other.in_v}]"
+                self.outputs.append(Output(target, value, self.roots[number]))
             above = self.structure.motions[above].parent
 
     # -- closures
@@ -409,8 +423,10 @@ class Trace:
         """The outputs g, bias and G."""
         g, bias, G = self.closure_rows()
         for row in g:
-            self.outputs += [Output(f"g[{row}]", g[row]), Output(f"bias[{row}]", bias[row])]
-            self.outputs += [Output(f"G[{row}][{j}]", entry) for j, entry in G[row].items()]
+            cell = self.cell_of(G[row])
+            values = {f"g[{row}]": g[row], f"bias[{row}]": bias[row]}
+            values |= {f"G[{row}][{j}]": entry for j, entry in G[row].items()}
+            self.outputs += [Output(target, value, cell) for target, value in values.items()]
 
     def closure_rows(self) -> tuple[Row, Row, dict[int, Row]]:
         """g, bias and the entries of G, by rows."""
@@ -472,7 +488,8 @@ class Trace:
             length, factor = distances[k], distances[k + 1]
             distance = self.recorder.call("sqrt", dot(apart, apart))
             coincident = self.take(self.structure.coincident)[0]
-            self.guards.append(Guard(distance, coincident * length))
+            cell = self.cell_of(j for j, _ in closure.support)
+            self.guards.append(Guard(distance, coincident * length, cell))
             d = scaled(factor / distance, apart)
             across = cross(d, rate)
             turning = dot(across, across) / (factor * distance)
@@ -538,17 +555,21 @@ class Trace:
         """The outputs B and J: placements and velocities in the axes of the bodies, and columns of
         the world Jacobian."""
         for k, joint in enumerate(self.structure.bushing_joints):
-            body = self.body(joint)
+            body, cell = self.body(joint), self.roots[self.structure.bodies[joint]]
             inverse = transposed(body.rotation)
             velocity = times(inverse, body.point_velocity(body.origin))
             columns = [entry for column in inverse for entry in column]
             motion = (*velocity, *times(inverse, body.spin))
             for i, values in enumerate((columns, body.origin, motion), 3 * k):
-                self.outputs += [Output(f"B[{i}][{n}]", value) for n, value in enumerate(values)]
+                self.outputs += [
+                    Output(f"B[{i}][{n}]", value, cell) for n, value in enumerate(values)
+                ]
         own = self.columns_by_rate()
         for j in self.structure.bushing_columns:
             values = (*own[j].linear, *own[j].angular)
-            self.outputs += [Output(f"J[{6 * j + n}]", value) for n, value in enumerate(values)]
+            self.outputs += [
+                Output(f"J[{6 * j + n}]", value, self.cells[j]) for n, value in enumerate(values)
+            ]
 
     # -- forces
 
@@ -561,11 +582,11 @@ class Trace:
             lawful[j] = lawful.get(j, zero) + acting
         for name, forces in (("tau", tau), ("lawful", lawful)):
             self.outputs += [
-                Output(f"{name}[{j}]", self.recorder.leaf(f"{name}[{j}]") + value)
+                Output(f"{name}[{j}]", self.recorder.leaf(f"{name}[{j}]") + value, self.cells[j])
                 for j, value in forces.items()
                 if not value.is_zero
             ]
-        self.outputs += [Output(f"own[{j}]", value) for j, value in own.items()]
+        self.outputs += [Output(f"own[{j}]", value, self.cells[j]) for j, value in own.items()]
 
     def generalised_forces(self) -> tuple[Row, Row, Row]:
         """Those of elements without laws, and with laws between links, without bushings; and the
@@ -581,9 +602,9 @@ class Trace:
                 to[j] = to.get(j, zero) + value
         return tau, lawful, own
 
-    def acting(self, law: int, value: Expression) -> Expression:
-        """The value of a law, or what is held in its place."""
-        self.outputs.append(Output(f"values[{law}]", value))
+    def acting(self, law: int, value: Expression, rates: Iterable[int]) -> Expression:
+        """The value of a law of an element on these rates, or what is held in its place."""
+        self.outputs.append(Output(f"values[{law}]", value, self.cell_of(rates)))
         return self.recorder.choose(self.held, self.recorder.leaf(f"y[{law}]"), value)
 
     def _generalised(
@@ -609,7 +630,7 @@ class Trace:
             if force.numbers.length:
                 _, friction, speed = self.take(force.numbers)
                 value = value + friction * self.recorder.call("tanh", rate / speed)
-            value = self.acting(force.held, -value)
+            value = self.acting(force.held, -value, force.columns)
             return [(j, factor * value) for j, factor in zip(force.columns, factors)]
         point, acting, moment = (
             self._wrench(force) if kind == "wrench" else self._spring(force, k, d, rest)
@@ -693,13 +714,13 @@ class Trace:
             return at_a, self._spring_without_length(apart, rate, k, d), self.nothing
         length = self.recorder.call("sqrt", dot(apart, apart))
         coincident = self.take(self.structure.coincident)[0]
-        self.guards.append(Guard(length, coincident * rest))
+        self.guards.append(Guard(length, coincident * rest, self.cell_of(force.columns)))
         inverse = 1.0 / length
         if force.numbers.length:  # the ends of a rope may meet
             inverse = self.recorder.choose(length, inverse, self.recorder.zero)
         line = scaled(inverse, apart)
         value = -(k * self._stretched(force, length - rest) + d * dot(line, rate))
-        return at_a, scaled(self.acting(force.held, value), line), self.nothing
+        return at_a, scaled(self.acting(force.held, value, force.columns), line), self.nothing
 
     def _spring_without_length(
         self, apart: Vector, rate: Vector, k: Expression, d: Expression

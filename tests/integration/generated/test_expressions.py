@@ -10,8 +10,8 @@ from srm_mbs.integration.generated.expressions import (
     Guard,
     Output,
     Recorder,
-    write_c,
 )
+from srm_mbs.integration.generated.writing import write_c
 
 
 @pytest.fixture
@@ -96,3 +96,30 @@ def test_a_choice_of_equal_expressions_is_none(recorder: Recorder, x: Expression
     assert recorder.choose(x, x, x) is x
     written = write_c([Output("g[0]", recorder.choose(x, recorder.one, recorder.zero))])
     assert "q[0] != 0.0 ? 1.0 : 0.0" in written.terms
+
+
+def _cells(recorder: Recorder, count: int, shared: int) -> list[Output]:
+    """Equal cells that need one expression of ``shared`` operations."""
+    common = recorder.leaf("q[0]")
+    for _ in range(shared):
+        common = common * common + 1.0
+    return [
+        Output(f"M[{i}]", common * recorder.leaf(f"v[{i * i}]") * recorder.leaf(f"p[{i}]", 1), i)
+        for i in range(count)
+    ]
+
+
+def test_equal_cells_are_written_once(recorder: Recorder) -> None:
+    written = write_c(_cells(recorder, 20, 0))
+    assert "for (int c = 0; c < 20; ++c)" in written.terms
+    assert "M[0 + 1 * c]" in written.terms
+    assert ", {9}, {16}" in written.terms
+    assert "for (int c = 0; c < 20; ++c)" in written.constants
+    assert written.constant_count == 20
+    assert written.operations < 8
+
+
+def test_cells_that_share_most_of_their_operations_share_them(recorder: Recorder) -> None:
+    written = write_c(_cells(recorder, 20, 50))
+    assert "for" not in written.terms
+    assert written.operations < 200

@@ -14,7 +14,7 @@ import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.integration.generated.algebra import algebra_of
-from srm_mbs.integration.generated.code import load_code
+from srm_mbs.integration.generated.code import generated_source, load_code
 from srm_mbs.integration.generated.structure import UnsupportedElementError, structure_of
 from srm_mbs.integration.kernel import backend
 from srm_mbs.integration.kernel.system import make_kernel_system
@@ -229,6 +229,23 @@ def test_evaluations_of_many_loops_are_those_of_the_kernel(loops: int) -> None:
     mechanism = srm.n_four_bar(loops)
     algebra = algebra_of(mechanism.model.nv, 2 * loops, 2 * loops, (), ())
     assert (algebra != "") == (loops == 19)
+    _agree(mechanism, count=2)
+
+
+def test_elements_of_equal_cells_are_computed_in_a_loop() -> None:
+    """Forces, their laws and guards as well; the order of the joints is not that of the cells."""
+    springs = [
+        srm.SpringDamper(
+            srm.Anchor(f"coupler_{i}", xyz=(0.5, 0.0, 0.1)),
+            srm.Anchor(f"crank_{i + 1}", xyz=(0.3 + 0.01 * i, 0.0, 0.0)),
+            stiffness=10.0 + i,
+            rest_length=0.4,
+            name=f"spring {i}",
+        )
+        for i in range(12)
+    ]
+    mechanism = replace(srm.n_four_bar(12), forces=springs)
+    assert generated_source(mechanism).count("c < 9;") == 2
     _agree(mechanism, count=2)
 
 

@@ -12,7 +12,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, update_wrapper
+from functools import update_wrapper
 from types import MappingProxyType
 from typing import Any, Generic, Protocol, Self, TypeVar
 
@@ -27,6 +27,7 @@ from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive, positions
 from srm_mbs.model.forces import ForceElement
 from srm_mbs.model.laws import Curve, Law
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import checked_name, vector_elements
 from srm_mbs.model.pinocchio_constraints import (
     PinocchioConstraints,

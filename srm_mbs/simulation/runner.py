@@ -289,8 +289,9 @@ def checked_options(mechanism: Any, options: RunOptions) -> RunOptions:
     key = (mechanism.constrained, others, types) if plain else None
     known = None if key is None else _known_options.get(key)
     if known is not None:
-        q0, v0 = options.q0, options.v0
-        return known if q0 is None and v0 is None else known._replace(q0=q0, v0=v0)
+        if options.q0 is None and options.v0 is None:
+            return known
+        return RunOptions._make(known[:2] + options[2:4] + known[4:])
     checked = _checked_anew(mechanism, options)
     if key is not None and checked.rtol == options.rtol:  # others warn each time
         if len(_known_options) >= KEPT_OPTIONS:
@@ -418,12 +419,12 @@ def _check_errors(
     q0, v0 = mechanism.q0, mechanism.v0
     units = mechanism.structure.units
     unit = constraint_units(mechanism, units)
-    speed = max(units.rate, *np.abs(v0 / units.coordinate).tolist())
     by_kernel = backend in COMPILED and not mechanism.drives
     if by_kernel:
         open_by, rate = largest_errors(mechanism, t, q0, v0, unit, system)
-        if open_by <= CONSISTENT and rate <= CONSISTENT * speed:
+        if open_by <= CONSISTENT and rate <= CONSISTENT * units.rate:
             return
+    speed = max(units.rate, *np.abs(v0 / units.coordinate).tolist())
     start = np.array([t]), q0[None], v0[None]
     if by_kernel:
         g, c = (e[0] for e in closure_errors(mechanism, *start, system))

@@ -179,10 +179,11 @@ def test_a_chunk_that_is_given_is_kept_however_long_its_cases_take(clock: Clock)
 
 
 @pytest.mark.parametrize(
-    ("kind", "longest", "seconds"), [(Executor, 32, 0.5), (ProcessPoolExecutor, 3, 0.05)]
+    ("kind", "longest", "last", "seconds"),
+    [(Executor, 32, 3, 0.5), (ProcessPoolExecutor, 3, 1, 0.05)],
 )
 def test_chunks_take_half_a_second_with_executors_of_other_packages(
-    kind: type[Executor], longest: int, seconds: float
+    kind: type[Executor], longest: int, last: int, seconds: float
 ) -> None:
     sent: list[tuple[int, float]] = []
 
@@ -198,6 +199,7 @@ def test_chunks_take_half_a_second_with_executors_of_other_packages(
 
     srm.sweep(pendulum(), {"v0": np.zeros((2000, 1))}, 1.0, executor=Reporting())
     assert max(length for length, _ in sent) == longest
+    assert sent[-2][0] == last  # the last has what is left
     assert {limit for _, limit in sent} == {2.0 * seconds}
 
 

@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -25,6 +24,7 @@ from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.dae import SemiExplicitDAE
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.reach import Reach
 from srm_mbs.simulation.dae_result import DaeResult
 from srm_mbs.simulation.dae_run import run_dae

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.simulation.options import numbers, positive
 from srm_mbs.simulation.result import SimulationResult
 

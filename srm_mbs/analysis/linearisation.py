@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
 from numbers import Integral
 from typing import Any
 
@@ -30,6 +29,7 @@ from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.singularities.local_analysis import TAU
 from srm_mbs.errors import InputError, get_logger, safe_repr
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.simulation.options import positive
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 

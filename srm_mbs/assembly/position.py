@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ from srm_mbs.dynamics.scaling import coordinate_units, row_angles
 from srm_mbs.dynamics.singularities.local_analysis import refine_singular_point
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.forces import OPEN_LIMIT, LimitSpring
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 CONSTRAINT_TOLERANCE = 1e-12

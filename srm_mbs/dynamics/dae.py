@@ -22,7 +22,6 @@ and passes isolated singularities of G B, where P and yhat stay bounded and y ne
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +31,7 @@ from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO, pivoted_qr, q_co
 from srm_mbs.dynamics.system import Zone
 from srm_mbs.errors import CallbackError, EvaluationError, InputError, safe_repr
 from srm_mbs.model.dae import SemiExplicitDAE
+from srm_mbs.model.lazy import cached_property
 
 
 class ObliqueProjection:

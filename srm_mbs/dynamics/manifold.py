@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ import pinocchio as pin
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import EvaluationError, InputError
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_tree
 
 ROTATION_PER_STEP = 1.5
@@ -189,12 +189,26 @@ class Manifold:
         self.model = model = mechanism.model
         self.nq, self.nv = model.nq, model.nv
         self.tangent_size = 2 * self.nv
-        self._groups = _groups(mechanism)
-        self._planar = [joint for joint in self._groups if joint.group == "se2"]
         self._flat = self.nq == self.nv
-        self.wraps = bool(len(_angle_pairs(mechanism)))
         self._unit = mechanism.structure.units.coordinate
-        self._position_of = _vector_coordinates(mechanism)
+
+    # Of the reference: runs of the compiled kernel read none of them.
+    @cached_property
+    def wraps(self) -> bool:
+        """See :class:`~srm_mbs.dynamics.system.System`."""
+        return bool(len(_angle_pairs(self.mechanism)))
+
+    @cached_property
+    def _groups(self) -> tuple[GroupJoint, ...]:
+        return _groups(self.mechanism)
+
+    @cached_property
+    def _planar(self) -> list[GroupJoint]:
+        return [joint for joint in self._groups if joint.group == "se2"]
+
+    @cached_property
+    def _position_of(self) -> IndexArray:
+        return _vector_coordinates(self.mechanism)
 
     @cached_property
     def _largest_scale(self) -> FloatArray:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,7 @@ from srm_mbs.dynamics.system import (
     Zone,
 )
 from srm_mbs.errors import EvaluationError
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import per_model, per_start
 
 
@@ -234,6 +235,8 @@ class Mechanics(Manifold):
 
     carries_yhat = True
     predicts = True
+    residual_scale = np.zeros(0)
+    """Factor (m,) from each scaled row in use to row units."""
 
     def __init__(self, mechanism: Mechanism, controller: Controller | None) -> None:
         super().__init__(mechanism)
@@ -252,8 +255,6 @@ class Mechanics(Manifold):
         self._first, self._last = -np.inf, np.inf
         self._bushings: dict[Evaluator, BushingStep] = {}
         self._applied: FloatArray | None = None
-        self._no_force = np.zeros(self.nv)
-        self._laws_at = np.zeros(self.nq), self._no_force
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Terms and workspaces share memory, which copies of them would not.
@@ -264,6 +265,15 @@ class Mechanics(Manifold):
     def data(self) -> pin.Data:
         """Pinocchio's workspace."""
         return workspace(self.model)
+
+    @cached_property
+    def _no_force(self) -> FloatArray:
+        return np.zeros(self.nv)
+
+    @cached_property
+    def _laws_at(self) -> tuple[FloatArray, FloatArray]:
+        """q and v of the stage evaluated last."""
+        return np.zeros(self.nq), self._no_force
 
     @property
     def controlled(self) -> bool:
@@ -479,7 +489,7 @@ class Mechanics(Manifold):
         """Those among :meth:`constants` that depend on the start, or that the model may change."""
         return {
             "unit": self._unit,
-            "gap_scale": np.zeros(0),
+            "gap_scale": self.residual_scale,
             "damping": self._damping if self.is_damped else None,
             "friction": self._friction if self.has_friction else None,
         }
@@ -593,11 +603,11 @@ class ClosedSystem(Mechanics):
 
     def __init__(self, mechanism: Mechanism, controller: Controller | None = None) -> None:
         super().__init__(mechanism, controller)
-        self.structure = mechanism.structure
+        self.structure = structure = mechanism.structure
         self.driven = bool(mechanism.drives)
         self.residual_scale = _residual_scale(mechanism)
         self._order = _graph_order(mechanism)
-        self.projection = Projection(self.structure.rank, self.structure.sigma_ref, self._order)
+        self.projection = Projection(structure.rank, structure.sigma_ref, self._order)
 
     @cached_property
     def loops(self) -> DrivenKinematics:
@@ -638,10 +648,6 @@ class ClosedSystem(Mechanics):
         """As for open mechanisms, and the closures."""
         own = super().constants()
         return own | {"drives": self.loops.drive_constants()} if self.mechanism.drives else own
-
-    def constants_of_start(self) -> dict[str, Any]:
-        """As for open mechanisms, and the scales of the closures."""
-        return super().constants_of_start() | {"gap_scale": self.residual_scale}
 
     def constants_of_model(self) -> dict[str, Any]:
         """As for open mechanisms, and the rows of the closures."""

@@ -9,7 +9,6 @@ For a point p of a body whose joint is at o, with the spatial velocity (v, w) an
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.wrenches import Placements
 from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.model.anchors import Anchor
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData
 
 Place = tuple[int, pin.SE3]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import islice
 from typing import NamedTuple
 
@@ -23,6 +22,7 @@ from srm_mbs.dynamics.constraints.rows import world_jacobian
 from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 RELATIVE_ROUNDING = 1e-12

@@ -178,8 +178,10 @@ class System(Protocol):
     """Whether sweeps carry yhat, which the zone replaces next to a singular configuration."""
     predicts: bool
     """Whether the exact multiplier is known: False for a DAE whose g_t is needed and not given."""
-    wraps: bool
-    """Whether angles count no turns, so that :meth:`difference` asks for a tangent near by."""
+
+    @property
+    def wraps(self) -> bool:
+        """Whether angles count no turns, so that :meth:`difference` asks for a tangent near by."""
 
     @property
     def time_dependent(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -12,6 +12,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.formats.files import open_regular, read_text
 from srm_mbs.formats.toml.description import parse_toml
 from srm_mbs.formats.xml import parse_xml, root_tag
+from srm_mbs.model.lazy import cached_property
 
 
 class Document:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 from xml.etree.ElementTree import Element, indent, tostring
 
@@ -19,6 +19,7 @@ from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.formats.graph.joint_graph import Body, Joint
 from srm_mbs.formats.toml.parameters import Place
 from srm_mbs.formats.toml.schema import PlanarEntry
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.reach import Reach
 
 

@@ -205,7 +205,7 @@ class BreakpointHandler:
         self._norm = norm
         self._evaluator: Any = system if evaluator is None else evaluator
         self.sample: Callable[[float, FloatArray], None] | None = None
-        self.arrivals = system.singularities is not None
+        self.arrivals = system.branch_system is not None
         self._index = 0
         self._nearness = SingularProximity()
         self._evaluate_within(0)

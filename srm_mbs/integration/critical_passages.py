@@ -17,7 +17,7 @@ itself.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -37,6 +37,7 @@ from srm_mbs.integration.control.placement import zero_within
 from srm_mbs.integration.methods.base import ErrorNorm, Method, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
+from srm_mbs.model.lazy import cached_property
 
 SEARCH = 0.6
 """Distance (rad, scene diagonals) from the predicted passage within which its critical

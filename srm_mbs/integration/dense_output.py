@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from itertools import pairwise
 from typing import Any, cast
 
@@ -35,6 +34,7 @@ from srm_mbs.integration.methods.base import StepResult
 from srm_mbs.integration.methods.branch_nodes import BRANCH_SIGMA
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
+from srm_mbs.model.lazy import cached_property
 
 TIME_TOLERANCE = 1e-12
 """Largest distance of an output time beyond the ends of a run, over the time, for rounding."""

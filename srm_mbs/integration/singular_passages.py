@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -44,6 +43,7 @@ from srm_mbs.dynamics.system import SingularityAnalysis, System
 from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
 from srm_mbs.integration.dense_output import CRITICAL, STEP_PLACEMENTS, DenseOutput, StepData
 from srm_mbs.integration.methods.butcher import SAME_STAGE, ButcherTableau
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 SLOPE_MARGIN = 1.5

@@ -24,7 +24,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -35,6 +34,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import checked_name, finite_number, finite_numbers, plain, unit_vector
 
 

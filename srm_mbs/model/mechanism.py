@@ -12,7 +12,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, update_wrapper
+from functools import update_wrapper
 from types import MappingProxyType
 from typing import Any, Generic, Protocol, Self, TypeVar
 
@@ -27,6 +27,7 @@ from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive, positions
 from srm_mbs.model.forces import ForceElement
 from srm_mbs.model.laws import Curve, Law
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import checked_name, vector_elements
 from srm_mbs.model.pinocchio_constraints import (
     PinocchioConstraints,
@@ -416,10 +417,10 @@ class MechanismData(ResultOwner):
 
     def _at_no_start(self) -> Self:
         """A copy that shares the results for the model and has none for the start."""
-        changed = object.__new__(type(self))
+        changed, set_ = object.__new__(type(self)), object.__setattr__
         for name, value in vars(self).items():
-            object.__setattr__(changed, name, value)
-        object.__setattr__(changed, "_start_results", {})
+            set_(changed, name, value)
+        set_(changed, "_start_results", {})
         return changed
 
     def __getstate__(self) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from srm_mbs.dynamics.singularities.branch_limit import lagrange_weights
 from srm_mbs.integration.dense_output import DenseOutput, StepData, checked_output_times
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.methods.base import Method
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.simulation.csv_export import write_table
 from srm_mbs.simulation.result import RunOutcome, Settings, Statistics
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -29,6 +28,7 @@ from srm_mbs.dynamics.observables import LINEAR, Observables, working_elements
 from srm_mbs.errors import KnownKeys
 from srm_mbs.integration.dense_output import StepData
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import per_model
 
 NODES = 8

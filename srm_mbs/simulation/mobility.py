@@ -8,7 +8,6 @@ on singular configurations, which a run passes between two output times: those c
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import coordinate_names
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.simulation.result import SimulationResult, check_run
 from srm_mbs.simulation.segmented_result import SegmentedResult
 

@@ -86,13 +86,16 @@ REFRESH = 0.1
 """Seconds between two updates; more often would slow the run."""
 
 
+_NO_TICK: AbstractContextManager[None] = nullcontext(None)
+
+
 def progress_of(
     progress: bool | Tick, system: System, t_end: float
 ) -> AbstractContextManager[Tick | None]:
     """The callback of the option ``progress``: the caller's own, a progress bar, or none."""
     if callable(progress):
         return nullcontext(progress)
-    return progress_bar(system, t_end) if progress else nullcontext(None)
+    return progress_bar(system, t_end) if progress else _NO_TICK
 
 
 @contextmanager

@@ -44,6 +44,7 @@ MOST_SAMPLES = 10**8
 SINGULAR_TOLERANCE = 1e-9
 """Default of ``singular_tolerance``: residual, over the size of the mechanism, up to which a
 critical configuration counts as singular; that of data with ten digits."""
+_NO_TIMES = np.zeros(0)
 METHODS: dict[str, Callable[..., Method]] = {
     "psrm": PSRM,
     "srm": partial(SRM, restart=True, carry=True),
@@ -373,7 +374,7 @@ def checked_singular_times(singular_times: Any, t0: float, t_end: float) -> Floa
 def checked_breakpoints(breakpoints: Any) -> FloatArray:
     """The given times, in any order."""
     if isinstance(breakpoints, tuple) and not breakpoints:
-        return np.zeros(0)
+        return _NO_TIMES
     remedy = "Give times (s) at which a force jumps or has a kink"
     return _given_times(breakpoints, "breakpoints", remedy)
 
@@ -410,7 +411,7 @@ def checked_samples(sample_time: Any, controller: Any, t0: float, t_end: float) 
     """Multiples (s) of ``sample_time`` within a run, at which a controller is sampled; often
     none."""
     if sample_time is None:
-        return np.zeros(0)
+        return _NO_TIMES
     period = positive(sample_time, "sample_time", " of seconds")
     if controller is None:
         raise InputError(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Protocol, Self, cast
 
 import numpy as np
@@ -44,6 +43,7 @@ from srm_mbs.integration.singular_passages import (
     find_crossings,
 )
 from srm_mbs.model.anchors import Anchor
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.simulation.energy_balance import EnergyBalance, energy_balance
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.streamed_output import StreamedOutput
@@ -273,7 +273,7 @@ class SimulationResult(RunOutcome):
         self.mechanism = mechanism
         self._run = run
         self.scheme = scheme
-        self.status = RunStatus(status)
+        self.status = status if type(status) is RunStatus else RunStatus(status)
         self._system = system
         self.t_eval = t_eval
         if t_eval is not None:
@@ -396,7 +396,11 @@ class SimulationResult(RunOutcome):
     def span(self) -> tuple[float, float]:
         """Start and end (s) of the run, whatever ``t`` holds."""
         output = self._run.output
-        return super().span if output is None else output.span
+        if output is not None:
+            return output.span
+        if self.t_eval is None:
+            return float(self.t[0]), float(self.t[-1])
+        return super().span
 
     @property
     def held(self) -> HeldForce | None:

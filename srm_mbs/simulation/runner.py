@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -50,9 +50,9 @@ from srm_mbs.integration.generated.policy import Meter, code_of_run
 from srm_mbs.integration.kernel import driver as kernel_driver
 from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend, code_is_compiled
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
-from srm_mbs.integration.kernel.driver import CompiledRecord
+from srm_mbs.integration.kernel.driver import CompiledRecord, StepSummary
 from srm_mbs.integration.kernel.marshalling import state_from
-from srm_mbs.integration.kernel.observables import closure_errors
+from srm_mbs.integration.kernel.observables import closure_errors, largest_errors
 from srm_mbs.integration.kernel.run import CompiledRun, first_stage
 from srm_mbs.integration.kernel.system import Evaluator, SuccessiveWorkspaces, shared
 from srm_mbs.integration.messages import (
@@ -67,8 +67,13 @@ from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
 from srm_mbs.integration.singular_endpoints import start
-from srm_mbs.integration.singular_passages import Bifurcation, find_bifurcations
+from srm_mbs.integration.singular_passages import (
+    REVERSAL_SIGMA,
+    Bifurcation,
+    find_bifurcations,
+)
 from srm_mbs.model.forces import LimitSpring
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import per_model, per_start, per_tree
 from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
 from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
@@ -284,8 +289,9 @@ def checked_options(mechanism: Any, options: RunOptions) -> RunOptions:
     key = (mechanism.constrained, others, types) if plain else None
     known = None if key is None else _known_options.get(key)
     if known is not None:
-        q0, v0 = options.q0, options.v0
-        return known if q0 is None and v0 is None else known._replace(q0=q0, v0=v0)
+        if options.q0 is None and options.v0 is None:
+            return known
+        return RunOptions._make(known[:2] + options[2:4] + known[4:])
     checked = _checked_anew(mechanism, options)
     if key is not None and checked.rtol == options.rtol:  # others warn each time
         if len(_known_options) >= KEPT_OPTIONS:
@@ -411,8 +417,15 @@ def _check_errors(
     mechanism: Mechanism, t: float, backend: str, system: OpenSystem | ClosedSystem | None
 ) -> None:
     q0, v0 = mechanism.q0, mechanism.v0
-    start = np.array([t]), q0[None], v0[None]
+    units = mechanism.structure.units
+    unit = constraint_units(mechanism, units)
     by_kernel = backend in COMPILED and not mechanism.drives
+    if by_kernel:
+        open_by, rate = largest_errors(mechanism, t, q0, v0, unit, system)
+        if open_by <= CONSISTENT and rate <= CONSISTENT * units.rate:
+            return
+    speed = max(units.rate, *np.abs(v0 / units.coordinate).tolist())
+    start = np.array([t]), q0[None], v0[None]
     if by_kernel:
         g, c = (e[0] for e in closure_errors(mechanism, *start, system))
     elif t == 0.0:
@@ -421,9 +434,6 @@ def _check_errors(
         g, c = (e[0] for e in constraint_errors(mechanism, *start))
     if not len(g):
         return
-    units = mechanism.structure.units
-    unit = constraint_units(mechanism, units)
-    speed = max(units.rate, *np.abs(v0 / units.coordinate).tolist())
     for what, values, limit in (("q0", g, CONSISTENT), ("v0", c, CONSISTENT * speed)):
         errors = np.abs(values) / unit
         if max(errors.tolist()) > limit:
@@ -452,9 +462,9 @@ def assemble_problem(
     """
     t0, t_end, method = options.t0, options.t_end, options.method
     samples = checked_samples(options.sample_time, options.controller, t0, t_end)
-    given = checked_breakpoints(options.breakpoints)
-    times = np.concatenate([given, mechanism.breakpoints(t0, t_end)])
-    intervals = smooth_intervals(times, samples, t0, t_end)
+    times = checked_breakpoints(options.breakpoints)
+    own = mechanism.breakpoints(t0, t_end)
+    intervals = smooth_intervals(np.append(times, own) if own else times, samples, t0, t_end)
     check_avoidable(options.singular_times, intervals.ends, t_end - t0)
     if before is None:
         by = chosen_backend(options.backend, method, options.placement, options.singular_times)
@@ -814,6 +824,7 @@ class FinishedRun:
         self._controlled = options.controller is not None or self._system.has_user_forces
         self.output: StreamedOutput | None = None
         self.again: Callable[[], SimulationResult] | None = None
+        self._streamed = problem.stream is not None
         if problem.stream is not None:
             last = record.data(options.method.scheme, self._system.tangent_size)
             kept = problem.stream.finish(last, record.status is RunStatus.FAILED)
@@ -861,8 +872,17 @@ class FinishedRun:
         return attempt_array(self._record.attempts)
 
     @cached_property
+    def _summary(self) -> StepSummary | None:
+        """Summary of the steps, if it can be had without their arrays."""
+        record = self._record
+        kept = isinstance(record, CompiledRecord) and not self._streamed
+        return cast(CompiledRecord, record).summary() if kept else None
+
+    @cached_property
     def stats(self) -> Statistics:
-        if self.output is not None:
+        if self._summary is not None:
+            steps, zone_steps = self._summary[:2]
+        elif self.output is not None:
             steps, zone_steps = self.output.count, self.output.zone_steps
         else:
             data = cast(StepData, self.steps)
@@ -877,6 +897,8 @@ class FinishedRun:
 
     @property
     def _stiff_intervals(self) -> list[tuple[float, float]]:
+        if self._summary is not None and not self._summary.stiff:
+            return []
         data = self.output or self.steps
         return [] if data is None else data.stiff_intervals
 
@@ -884,6 +906,9 @@ class FinishedRun:
     def bifurcations(self) -> tuple[Bifurcation, ...]:
         if self.output is not None:
             return self.output.bifurcations
+        summary = self._summary
+        if summary is not None and not (summary.held or summary.least_sigma < REVERSAL_SIGMA):
+            return ()  # as the search for them, which needs the steps
         failed = self._record.status is RunStatus.FAILED
         steps = cast(StepData, self.steps)
         return find_bifurcations(self._system, steps, lambda: cast(DenseOutput, self.dense), failed)

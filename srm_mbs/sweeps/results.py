@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from srm_mbs.errors import InputError, get_logger
 from srm_mbs.formats.files import whole_file
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.simulation.csv_export import write_table
 from srm_mbs.sweeps.cases import Case
 from srm_mbs.sweeps.tasks import Outcome

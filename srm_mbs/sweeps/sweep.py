@@ -11,7 +11,7 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPool
 from contextlib import ExitStack, closing
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 from srm_mbs.api import simulate
 from srm_mbs.dynamics.mechanism import Mechanism
@@ -37,18 +37,9 @@ log = get_logger(__name__)
 
 MAX_PENDING_CHUNKS = 512
 """Most chunks that are submitted at once: each has a copy of the mechanism."""
-LEAST_PENDING_CHUNKS = 16
-"""Chunks of adaptive length that are submitted at once, if there are so many: more than the workers
-of most executors, whose number no interface tells."""
-CHUNK_SECONDS, SCHEDULED_CHUNK_SECONDS = 0.05, 0.5
-"""Time that a chunk of adaptive length is to take, with executors of the standard library and with
-others, whose schedulers, as that of Dask, spend 10 ms of CPU time on one: sending a chunk takes
-about a hundredth of it, and a progress bar still moves."""
 LONGEST_CHUNK = 2.0
-"""Time of such a chunk, over the one it is to take, after which a worker begins no further case."""
-GROWTH = 4
-"""Largest ratio of the lengths of such a chunk and of the one that it follows from: the first run
-of a worker takes longer than others."""
+"""Time of a chunk of adaptive length, over the one it is to take, after which a worker begins no
+further case."""
 SHORTEST_TIME = 1e-6
 """Time (s) of a chunk below which it is not measured."""
 _REFUSED_OPTIONS = {
@@ -103,8 +94,9 @@ def sweep(
         sequentially in this thread.  Threads share the mechanism; processes get it pickled.
     chunk
         Number of cases that a worker runs at a time, which are lost together if it dies.  By
-        default as many as take about 0.05 s, by what the last ones took: a worker that dies then
-        loses what it did in the last 0.1 s, and the case that it was at.
+        default as many as take about 0.05 s, by what the last ones took (with executors of other
+        packages 0.5 s): a worker that dies then loses what it did in the last 0.1 s (1 s), and the
+        case that it was at.
     resume
         A file to which every finished case is appended; the cases that it already has are read
         instead of being run.  Cases that raised an exception are repeated.
@@ -204,6 +196,36 @@ def _check_options(options: Mapping[str, Any]) -> None:
     mechanism_method(options.get("method", "psrm"), options.get("tableau"))
 
 
+class _Pace(NamedTuple):
+    """Lengths of adaptive chunks.
+
+    Attributes
+    ----------
+    seconds
+        Time that a chunk is to take: sending it takes about a hundredth of that, and a progress bar
+        still moves.
+    least_seconds
+        Time that a chunk takes at least, although workers would end together more closely.
+    growth
+        Largest ratio of the lengths of a chunk and of the one that it follows from: the first run
+        of a worker takes longer than others.
+    pending
+        Chunks that are submitted at once, if there are so many: more than the workers of most
+        executors, whose number no interface tells.
+    """
+
+    seconds: float
+    least_seconds: float
+    growth: int
+    pending: int
+
+
+STANDARD = _Pace(0.05, 0.0, 4, 16)
+"""With executors of the standard library."""
+SCHEDULED = _Pace(0.5, 0.05, 16, 8)
+"""With others, whose schedulers, as that of Dask, spend 10 ms of CPU time on a chunk."""
+
+
 class _Waiting:
     """The cases that no worker has, in chunks.
 
@@ -212,18 +234,18 @@ class _Waiting:
     cases
         All of them.
     chunk
-        Number of cases in each; None: as many as a worker runs in about ``seconds``, by the last
+        Number of cases in each; None: as many as a worker runs in the time of ``pace``, by the last
         chunk that was finished, and fewer towards the end, so that workers end together.
-    seconds
-        Time that a chunk of adaptive length is to take.
+    pace
+        Of chunks of adaptive length.
     """
 
-    def __init__(self, cases: Sequence[Case], chunk: int | None, seconds: float) -> None:
+    def __init__(self, cases: Sequence[Case], chunk: int | None, pace: _Pace) -> None:
         self._cases = deque(cases)
-        self._chunk, self._seconds = chunk, seconds
-        self._size = 1
+        self._chunk, self._pace = chunk, pace
+        self._size = self._least = 1
         self._workers: set[tuple[str, int, int]] = set()
-        self.time_limit = math.inf if chunk is not None else LONGEST_CHUNK * seconds
+        self.time_limit = math.inf if chunk is not None else LONGEST_CHUNK * pace.seconds
         """Seconds after which a worker returns what it has not begun."""
 
     @property
@@ -239,22 +261,24 @@ class _Waiting:
         return (
             MAX_PENDING_CHUNKS
             if self._chunk is not None
-            else min(MAX_PENDING_CHUNKS, max(LEAST_PENDING_CHUNKS, 2 * self._parallel))
+            else min(MAX_PENDING_CHUNKS, max(self._pace.pending, 2 * self._parallel))
         )
 
     def next_chunk(self) -> list[Case]:
         """The next cases; none if there are no more."""
         size = self._chunk
         if size is None:
-            size = max(1, min(self._size, len(self._cases) // (2 * self._parallel)))
+            together = max(self._least, len(self._cases) // (2 * self._parallel))
+            size = min(self._size, together)
         return [self._cases.popleft() for _ in range(min(size, len(self._cases)))]
 
     def learn(self, sent: Sequence[Case], ran: Ran) -> None:
         """Take back what a worker has not begun, and choose the length of the next chunks."""
         self._workers.add(ran.worker)
         self._cases.extendleft(reversed(sent[len(ran.outcomes) :]))
-        fitting = int(self._seconds * len(ran.outcomes) / max(ran.seconds, SHORTEST_TIME))
-        self._size = max(1, min(fitting, GROWTH * len(sent)))
+        rate, pace = len(ran.outcomes) / max(ran.seconds, SHORTEST_TIME), self._pace
+        self._size = max(1, min(int(pace.seconds * rate), pace.growth * len(sent)))
+        self._least = max(1, int(pace.least_seconds * rate))
 
 
 def _finished(
@@ -267,8 +291,7 @@ def _finished(
         return
     sent = task if isinstance(executor, ThreadPoolExecutor) else packed(task)
     standard = isinstance(executor, ThreadPoolExecutor | ProcessPoolExecutor)
-    seconds = CHUNK_SECONDS if standard else SCHEDULED_CHUNK_SECONDS
-    waiting = _Waiting(cases, chunk, seconds)
+    waiting = _Waiting(cases, chunk, STANDARD if standard else SCHEDULED)
     running: dict[Future[Ran], list[Case]] = {}
     done: SimpleQueue[Future[Ran]] = SimpleQueue()
     try:

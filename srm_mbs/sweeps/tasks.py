@@ -20,11 +20,14 @@ from srm_mbs.api import Solution, simulate
 from srm_mbs.assembly.assemble import assemble
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError, SimulationError, printable, safe_repr
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.simulation.result import check_run
 from srm_mbs.sweeps.cases import RESERVED, STARTS, varied
 
 Value = bool | int | float | str | None
 Measure = Callable[[Solution], Mapping[str, Any]]
+
+_PLAIN = frozenset((bool, int, float, str, type(None)))
 
 ERROR = "error"
 """Status of a case that raised an exception."""
@@ -45,8 +48,8 @@ def standard_measures(solution: Solution) -> dict[str, Value]:
             last = len(solution.t) - 1
             ends: Any = slice(None, None, last) if last else [0, 0]
             t, q, v = solution.t[ends], solution.q[ends], solution.v[ends]
-            g, _ = solution.observables.closure_errors(t, q, v)
-            drift, energy = np.sqrt(g[1] @ g[1]), solution.observables.energies(q, v).sum(axis=1)
+            g, _ = solution.observables.closure_errors(t[1:], q[1:], v[1:])
+            drift, energy = np.sqrt(g[0] @ g[0]), solution.observables.energies(q, v).sum(axis=1)
         else:
             read = solution.at(solution.span)
             drift, energy = read.drift[1, 0], read.energy
@@ -116,6 +119,10 @@ class Task:
         except Exception as error:  # of the user's functions as well; the other cases go on
             return raised(error)
 
+    @cached_property
+    def _varied(self) -> tuple[str, ...]:
+        return varied(self.source)
+
     def _made(self, parameters: Mapping[str, Any]) -> tuple[Mechanism, dict[str, Any]]:
         """The mechanism of a case, and its options."""
         chosen = dict(self.simulate_options)
@@ -123,7 +130,7 @@ class Task:
             made = self.source(**parameters)
             mechanism, more = made if isinstance(made, tuple) else (made, {})
             return mechanism, chosen | more
-        values = {name: parameters[name] for name in varied(self.source) if name in parameters}
+        values = {name: parameters[name] for name in self._varied if name in parameters}
         source = self.source.with_parameters(**values) if values else self.source
         start = {name: parameters[name] for name in STARTS if name in parameters}
         if "q" in start or "v" in start:
@@ -162,9 +169,10 @@ def checked_measures(
                 element="measure",
                 remedy="Give the measure another name",
             )
-        plain = (
-            value.item() if isinstance(value, np.generic | np.ndarray) and not value.ndim else value
-        )
+        plain = value
+        if type(value) not in _PLAIN:
+            array = isinstance(value, np.generic | np.ndarray)
+            plain = value.item() if array and not value.ndim else value
         if not isinstance(name, str) or not isinstance(plain, Value):
             raise InputError(
                 f"it returned {safe_repr(name)}: {safe_repr(value)}",

@@ -30,19 +30,19 @@ def same(a: list[Any], b: list[Any]) -> bool:
 def test_the_message_is_made_once_and_not_before_it_is_read(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    looked: list[object] = []
-    search = runner.find_bifurcations
+    made: list[object] = []
+    sentences = runner.bifurcation_sentences
 
     def counted(*arguments: Any) -> Any:
-        looked.append(arguments)
-        return search(*arguments)
+        made.append(arguments)
+        return sentences(*arguments)
 
-    monkeypatch.setattr(runner, "find_bifurcations", counted)
+    monkeypatch.setattr(runner, "bifurcation_sentences", counted)
     solution = srm.simulate(srm.load("slider_crank"), 1.0, backend=srm.backend())
     if solution.settings.backend != "python":  # the reference keeps arrays, not its steps
-        assert not looked
+        assert not made
     assert solution.message == "The run reached t = 1 s." == solution.message
-    assert len(looked) == 1
+    assert len(made) == 1
 
 
 def test_what_is_read_after_other_runs_is_what_the_run_left() -> None:

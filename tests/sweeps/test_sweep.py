@@ -25,6 +25,7 @@ import pytest
 import srm_mbs as srm
 from benchmarks import sweep_throughput as throughput
 from srm_mbs.sweeps.fingerprint import fingerprint
+from srm_mbs.sweeps.tasks import Outcome, Ran
 from tests.support.snapshots import check_messages, check_refusals, refused
 from tests.support.sweeping import deadly, dying_once, lowest, pendulum, period, states
 
@@ -175,6 +176,31 @@ def test_a_worker_returns_the_cases_that_it_has_no_time_for(clock: Clock) -> Non
 def test_a_chunk_that_is_given_is_kept_however_long_its_cases_take(clock: Clock) -> None:
     executor = waited([1.0] * 7, clock, chunk=3)
     assert executor.chunks == [(3, 3), (3, 3), (1, 1)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "longest", "last", "seconds"),
+    [(Executor, 32, 3, 0.5), (ProcessPoolExecutor, 3, 1, 0.05)],
+)
+def test_chunks_take_half_a_second_with_executors_of_other_packages(
+    kind: type[Executor], longest: int, last: int, seconds: float
+) -> None:
+    sent: list[tuple[int, float]] = []
+
+    class Reporting(kind):  # type: ignore[misc, valid-type]
+        """Reports at once that each case took 1/64 s, and runs none."""
+
+        def submit(self, fn: Any, task: Any, chunk: Any, time_limit: float) -> Future[Ran]:  # type: ignore[override]
+            sent.append((len(chunk), time_limit))
+            future: Future[Ran] = Future()
+            outcomes = [Outcome(True, "finished", "", {})] * len(chunk)
+            future.set_result(Ran(outcomes, len(chunk) / 64.0, ("host", 1, 1)))
+            return future
+
+    srm.sweep(pendulum(), {"v0": np.zeros((2000, 1))}, 1.0, executor=Reporting())
+    assert max(length for length, _ in sent) == longest
+    assert sent[-2][0] == last  # the last has what is left
+    assert {limit for _, limit in sent} == {2.0 * seconds}
 
 
 def test_rows_keep_the_order_of_the_cases_whatever_finishes_first() -> None:

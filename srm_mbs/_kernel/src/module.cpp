@@ -211,6 +211,25 @@ struct PySystem {
                               owned_array(std::move(rates), {n, rows}));
     }
 
+    // The largest |g - s| and |G v - s'| at q (nq,) and v (nv,), over the units (rows,) of the rows.
+    nb::tuple largest_errors(double t, const Array& q, const Array& v, const Array& unit) {
+        const int rows = system->rows();
+        const double* over = vector_of(unit, rows, "unit");
+        const double *from = vector_of(q, system->nq, "q"), *rate = vector_of(v, system->nv, "v");
+        std::vector<double> state(from, from + system->nq), g(rows), rates(rows);
+        state.insert(state.end(), rate, rate + system->nv);
+        system->closure_errors(t, state.data(), g.data(), rates.data());
+        const auto largest = [&](const std::vector<double>& errors) {
+            double out = 0.0;
+            for (int i = 0; i < rows; ++i) {
+                const double error = std::abs(errors[i]) / over[i];
+                if (!(error <= out)) out = error;  // NaN, too
+            }
+            return out;
+        };
+        return nb::make_tuple(largest(g), largest(rates));
+    }
+
     // G (n, rows, nv) at the configurations q (n, nq), with drives and -s' as its last column
     // (n, rows, nv + 1).
     nb::object jacobians(const Array& t, const Array& q) {
@@ -514,6 +533,8 @@ void bind_system(nb::module_& m) {
                  s.system->begin_step(t, vector_of(state, s.state_size(), "state"));
              })
         .def("closure_errors", &PySystem::closure_errors)
+        .def("largest_errors", &PySystem::largest_errors, nb::arg("t"), nb::arg("q"), nb::arg("v"),
+             nb::arg("unit"))
         .def("jacobians", &PySystem::jacobians)
         .def("rows_at", &PySystem::rows_at)
         .def("close", &PySystem::close, nb::arg("algebra"), nb::arg("row_unit"), nb::arg("units"),
@@ -919,6 +940,21 @@ void bind_run(nb::module_& m) {
         return view(r.numbers, {5, r.records.ranks.size()}, self);
     });
     records
+        // Numbers of steps and of those with a zone, the least sigma, whether a stage kept the
+        // normals of the last node, and whether the problem was found to be stiff.
+        .def_prop_ro("summary",
+                     [](const PyRecords& r) {
+                         const StepRecords& s = r.records;
+                         const auto any = [](const std::vector<double>& flags) {
+                             return std::any_of(flags.begin(), flags.end(),
+                                                [](double flag) { return flag != 0.0; });
+                         };
+                         double least = std::numeric_limits<double>::infinity();
+                         for (double sigma : s.sigmas)
+                             if (!(sigma >= least)) least = sigma;
+                         return nb::make_tuple(s.ranks.size(), s.zones.size(), least, any(s.held),
+                                               any(s.stiff));
+                     })
         .def_prop_ro("break_count", [](const PyRecords& r) { return r.records.breaks.size(); })
         .def_prop_ro("end_rate", [](const PyRecords& r) { return owned_array(r.end_rate); })
         .def_prop_ro("zones", [](const PyRecords& r) { return r.records.zones; });

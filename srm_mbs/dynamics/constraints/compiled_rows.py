@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rheonomic import unscaled_rows
 from srm_mbs.dynamics.constraints.row_algebra import CompiledAlgebra, RowAlgebra
 from srm_mbs.dynamics.constraints.rows import COINCIDENT, LoopKinematics
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 _NO_NUMBERS = np.zeros(0)

@@ -17,7 +17,7 @@ rows G of closures and drives lose rank on a motion, [G, -s'] does, because G v 
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ from srm_mbs.dynamics.scaling import (
     row_units,
 )
 from srm_mbs.model.drives import in_order_of_rows, positions
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model, per_start, per_tree
 
 CLEARLY_MORE = 1e-12

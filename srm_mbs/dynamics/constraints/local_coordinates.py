@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
@@ -23,6 +22,7 @@ from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.newton import newton
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR, THIRD_ORDER
+from srm_mbs.model.lazy import cached_property
 
 CONSTRAINT_TOLERANCE = 1e-12
 """Largest closure error of a point of the chart, in row units."""

@@ -200,6 +200,8 @@ class Projection:
         How many factorisations were done; 0 for a mechanism without closures.
     """
 
+    _white = np.zeros((0, 0))  # of no rows and coordinates: the first factor() allocates its own
+
     def __init__(self, rank: int, sigma_ref: float, order: Sequence[int] = ()) -> None:
         self.structural_rank = rank
         self._graph_order = order
@@ -209,7 +211,6 @@ class Projection:
         self.rank = rank
         self.rank_deficient = False
         self.held: FloatArray | None = None
-        self._allocate(0, 0)
 
     def _allocate(self, m: int, nv: int) -> None:
         """Workspace of :meth:`factor` for m rows: (G, f), which becomes (W, L^-1 f) in place, and

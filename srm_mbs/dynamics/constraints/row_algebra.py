@@ -25,7 +25,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -44,6 +44,7 @@ from srm_mbs.dynamics.constraints.projection import (
     whiten,
 )
 from srm_mbs.errors import EvaluationError
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import vector_elements
 
 GRAPH_ORDER_ABOVE = 64

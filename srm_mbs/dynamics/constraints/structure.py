@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +40,7 @@ from srm_mbs.dynamics.constraints.rows import Elimination, world_jacobian
 from srm_mbs.dynamics.scaling import Units, coordinate_units, row_units
 from srm_mbs.errors import EvaluationError, get_logger
 from srm_mbs.model.drives import in_order_of_rows
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model, per_start, per_tree
 from srm_mbs.model.validation import check_inertia
 

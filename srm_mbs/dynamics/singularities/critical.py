@@ -19,12 +19,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, column_groups
+from srm_mbs.model.lazy import cached_property
 
 ITERATIONS = 12
 DIFFERENCE = 1e-5

@@ -18,13 +18,13 @@ With drives, a configuration q (nq,) with rates (nv,) means (q, t), (nq + 1,), w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.row_algebra import singular_value
+from srm_mbs.model.lazy import cached_property
 
 SINGULAR = 1e-7
 """Singular value of the normalised G that counts as zero: the square root of round-off, because a

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from copy import copy
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple, Self
 
@@ -18,6 +18,7 @@ from srm_mbs.formats.graph.joint_graph import ROOT_JOINT
 from srm_mbs.formats.planar.shapes import direction_angle, fitted, own_axes, turned
 from srm_mbs.formats.toml.schema import LENGTH_UNITS, PlanarBar, PlanarEntry, PlanarSlider
 from srm_mbs.model.anchors import WORLD
+from srm_mbs.model.lazy import cached_property
 
 RESERVED = (WORLD, "universe", ROOT_JOINT)
 """Names of the ground, of Pinocchio's first frame, and of the joint of a base."""

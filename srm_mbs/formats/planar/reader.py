@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element
@@ -57,6 +57,7 @@ from srm_mbs.formats.toml.parameters import Place
 from srm_mbs.formats.toml.schema import PlanarEntry, PlanarSlider
 from srm_mbs.formats.translation import PLANAR, Numbers, Options, Translation, urdf_text
 from srm_mbs.model.anchors import WORLD
+from srm_mbs.model.lazy import cached_property
 
 HINGE_AXIS = (0.0, -1.0, 0.0)
 """Axis of all pins, in the axes of the world."""

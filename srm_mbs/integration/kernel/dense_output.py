@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import CompiledObservables
 from srm_mbs.integration.kernel.system import make_kernel_system, shared, workspace
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.model.lazy import cached_property
 
 
 def dense_output(

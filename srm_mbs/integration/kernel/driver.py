@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,28 @@ from srm_mbs.integration.kernel.marshalling import DECISIONS, steps_from
 from srm_mbs.integration.kernel.run import CompiledRun, ReturnReason
 from srm_mbs.integration.messages import RunFailure, StopReason
 from srm_mbs.integration.methods.butcher import ButcherTableau
+
+
+class StepSummary(NamedTuple):
+    """Facts about the steps of a run that most users need.
+
+    Attributes
+    ----------
+    steps, zone_steps
+        Number of accepted steps, and of those with a zone.
+    least_sigma
+        The least sigma of their stages.
+    held
+        Whether a stage kept the normals of the last node.
+    stiff
+        Whether the problem was found to be stiff.
+    """
+
+    steps: int
+    zone_steps: int
+    least_sigma: float
+    held: bool
+    stiff: bool
 
 
 @dataclass
@@ -68,6 +90,10 @@ class CompiledRecord(RunRecord):
         if len(times) != 2:
             return None
         return np.array([times[0], self.stop]), np.array([states[0], self.stop_state])
+
+    def summary(self) -> StepSummary | None:
+        """The summary of the steps that no sink took, after :meth:`close`; None before."""
+        return None if self._records is None else StepSummary(*self._records.summary)
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from srm_mbs.dynamics.observables import (
 from srm_mbs.integration.kernel.marshalling import force_struct, system_struct
 from srm_mbs.integration.kernel.system import KEPT, workspace
 from srm_mbs.model.drives import in_order_of_rows
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 
@@ -90,6 +90,23 @@ def closure_errors(
             return kernel_system.closure_errors(*_states(t, q, v))  # type: ignore[no-any-return]
     except ArithmeticError:
         return constraint_errors(mechanism, t, q, v)  # raises the error that says why
+
+
+def largest_errors(
+    mechanism: Mechanism,
+    t: float,
+    q: FloatArray,
+    v: FloatArray,
+    unit: FloatArray,
+    system: ClosedSystem | OpenSystem | None = None,
+) -> tuple[float, float]:
+    """The largest errors of :func:`closure_errors` at one state, q (nq,) and v (nv,), and their
+    rates, over the units (rows,) of the rows."""
+    try:
+        with _Lent(_idle_all_rows(mechanism), mechanism, system) as kernel_system:
+            return kernel_system.largest_errors(t, q, v, unit)  # type: ignore[no-any-return]
+    except ArithmeticError:
+        return np.inf, np.inf
 
 
 class CompiledObservables(Observables):

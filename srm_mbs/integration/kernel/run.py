@@ -48,6 +48,10 @@ class ReturnReason(IntEnum):
     """The end lies next to a singular configuration."""
 
 
+_REASONS = tuple(ReturnReason)
+"""By their numbers."""
+
+
 def first_stage(
     evaluator: Evaluator,
     method: Method,
@@ -73,10 +77,12 @@ def first_stage(
     InputError, EvaluationError
         As ``start``.
     """
-    with suppress(ArithmeticError):  # the reference raises the error that says why
+    try:
         found = evaluator.kernel_system.first_stage(t, state, stiff)
         if not found.sigma < singular_endpoints.NEAR_SINGULAR_SIGMA:
             return found
+    except ArithmeticError:
+        pass  # the reference raises the error that says why
     system = evaluator.system
     memory = singular_endpoints.start(system, method, t, state, norm, t_end, evaluator)
     memory.stiff = stiff
@@ -168,7 +174,8 @@ class CompiledRun:
 
     def advance(self, steps: int = 0) -> ReturnReason:
         """Make ``steps`` steps, or with 0 those of CHUNK seconds; the reason of the return."""
-        return ReturnReason(self.core.advance(steps, CHUNK))
+        reason: int = self.core.advance(steps, CHUNK)
+        return _REASONS[reason]
 
     def attempt_from(
         self, t: float, state: FloatArray, memory: IntegratorState, control: Any
@@ -189,7 +196,7 @@ class CompiledRun:
         """
         known = marshalling.state_struct(memory)
         reason, decision = self.core.attempt_from(t, state, known, control)
-        return ReturnReason(reason), None if decision < 0 else DECISIONS[decision]
+        return _REASONS[reason], None if decision < 0 else DECISIONS[decision]
 
     def last(self) -> StepResult:
         """The step made last."""

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from contextlib import ExitStack, suppress
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -72,7 +71,7 @@ class workspace:  # noqa: N801 - used as a function
     daemon thread aborts the program.
     """
 
-    __slots__ = ("_code", "_kernel_system", "_system")
+    __slots__ = ("_code", "_kernel_system", "_pool", "_system")
 
     def __init__(self, system: ClosedSystem | OpenSystem, code: Any = None) -> None:
         self._system, self._code = system, code
@@ -80,7 +79,9 @@ class workspace:  # noqa: N801 - used as a function
     def __enter__(self) -> Any:
         core.enter_python()  # type: ignore[union-attr]
         try:
-            self._kernel_system = _idle_or_new(self._system, self._code)
+            system = self._system
+            self._pool = idle_workspaces(system.mechanism) if shared(system) else None
+            self._kernel_system = _idle_or_new(self._pool, system, self._code)
         except BaseException:
             core.leave_python()  # type: ignore[union-attr]
             raise
@@ -88,20 +89,30 @@ class workspace:  # noqa: N801 - used as a function
 
     def __exit__(self, kind: Any, *_: object) -> None:
         try:
-            if kind is None and shared(self._system):
-                idle_workspaces(self._system.mechanism).append(self._kernel_system)
+            if kind is None and self._pool is not None:
+                self._pool.append(self._kernel_system)
         finally:
             core.leave_python()  # type: ignore[union-attr]
 
 
-class SuccessiveWorkspaces(ExitStack):
+class SuccessiveWorkspaces:
     """Kernel systems for one user, who needs one after the other: the same as long as the equations
-    of motion are."""
+    of motion are.  A context manager."""
+
+    __slots__ = ("_kernel_system", "_lent", "_system")
 
     def __init__(self) -> None:
-        super().__init__()
         self._system: ClosedSystem | OpenSystem | None = None
         self._kernel_system: Any = None
+        self._lent: workspace | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        lent, self._lent = self._lent, None
+        if lent is not None:
+            lent.__exit__(*error)
 
     def of(self, system: ClosedSystem | OpenSystem, code: Any) -> Any:
         """That of ``system``, as new; ``code`` as for :func:`make_kernel_system`."""
@@ -109,9 +120,10 @@ class SuccessiveWorkspaces(ExitStack):
             self._kernel_system.renew(**system.constants_of_start())
         else:
             self._system = None
-            self.close()
-            self._kernel_system = self.enter_context(workspace(system, code))
-            self._system = system
+            self.__exit__(None)
+            lent = workspace(system, code)
+            self._kernel_system = lent.__enter__()
+            self._lent, self._system = lent, system
         return self._kernel_system
 
     def evaluator(self, system: ClosedSystem | OpenSystem) -> Evaluator | ClosedSystem | OpenSystem:
@@ -119,14 +131,16 @@ class SuccessiveWorkspaces(ExitStack):
         return Evaluator(system, self._kernel_system) if system is self._system else system
 
 
-def _idle_or_new(system: ClosedSystem | OpenSystem, code: Any) -> Any:
-    if shared(system):
-        with suppress(IndexError):  # deque: two threads never get the same
-            kernel_system = idle_workspaces(system.mechanism).pop()
-            kernel_system.renew(**system.constants_of_start())
-            kernel_system.use_code(code)
-            return kernel_system
-    return make_kernel_system(system, code)
+def _idle_or_new(pool: deque[Any] | None, system: ClosedSystem | OpenSystem, code: Any) -> Any:
+    if not pool:
+        return make_kernel_system(system, code)
+    try:
+        kernel_system = pool.pop()  # deque: two threads never get the same
+    except IndexError:  # the other one took the last
+        return make_kernel_system(system, code)
+    kernel_system.renew(**system.constants_of_start())
+    kernel_system.use_code(code)
+    return kernel_system
 
 
 class _KernelTerms:

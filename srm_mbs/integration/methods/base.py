@@ -9,7 +9,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +18,7 @@ from srm_mbs.dynamics.system import System, Zone
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.tableaus import get_tableau
+from srm_mbs.model.lazy import cached_property
 
 NEGLIGIBLE = 1e-3
 """Effect of an evaluation, over the tolerance, below which it is not made."""

@@ -26,7 +26,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from fractions import Fraction
-from functools import cached_property
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Any
@@ -35,6 +34,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.model.lazy import cached_property
 
 ExactRow = tuple[Fraction, ...]
 ExactMatrix = tuple[ExactRow, ...]

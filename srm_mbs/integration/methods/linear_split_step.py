@@ -35,7 +35,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -44,6 +43,7 @@ from srm_mbs.dynamics.system import System, Zone
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Linearisation, StepResult
 from srm_mbs.integration.methods.split_step import SplitStep, Stages
 from srm_mbs.integration.methods.stiffness import largest_eigenvalue
+from srm_mbs.model.lazy import cached_property
 
 DIFFERENCE = 2.0**-26
 """Step of a difference by a coordinate, over its size: the root of the rounding."""

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.singularities.branch_limit import lagrange_weights
+from srm_mbs.model.lazy import cached_property
 
 LARGEST_EXTRAPOLATION = 4.0
 """Longest extrapolation beyond the last node, over the time that the nodes span."""

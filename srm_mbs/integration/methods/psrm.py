@@ -7,7 +7,6 @@ r"""The Predicted Sequential Regularization Method in all its forms.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import cast
 
 from srm_mbs.errors import InputError, safe_repr
@@ -23,6 +22,7 @@ from srm_mbs.integration.methods.thesis.sweep import (
     checked_regulariser,
     interpolant,
 )
+from srm_mbs.model.lazy import cached_property
 
 _FORMS = {"exact": ("split", "sweep", "fused"), "simple": ("sweep",)}
 """Corrections of each prediction, the default first."""

@@ -10,7 +10,6 @@ DAEs, (2.2) or (2.4) (:class:`srm_mbs.SemiExplicitDAE`).  The result is sweep m.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -22,6 +21,7 @@ from srm_mbs.integration.methods.tableaus import check_explicit
 from srm_mbs.integration.methods.thesis.iterated_sweeps import First, IteratedSweeps
 from srm_mbs.integration.methods.thesis.regularisation import Regularisation, parse_eps
 from srm_mbs.integration.methods.thesis.sweep import checked_regulariser, interpolant
+from srm_mbs.model.lazy import cached_property
 
 LARGEST_CARRIED = 3
 """Number of sweeps up to which restarting with the carried multiplier is stable (measured)."""

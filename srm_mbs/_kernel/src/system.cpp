@@ -1078,6 +1078,22 @@ void System::free_acceleration(double* out) {
     projection_->unwhiten(out);
 }
 
+void System::impulse_response(const double* q, const double* n, double* along, double* free) {
+    auto& w = *work_;
+    std::copy(q, q + nq, w.q.data());
+    w.v.setZero();
+    pinocchio_model::compute_terms(w);
+    update_closures(q, false);
+    update_drives(0.0, false);
+    std::fill(bias_.begin(), bias_.end(), 0.0);
+    Projection& p = *projection_;
+    p.factor(w.data.M.data(), n, bias_.data(), -1.0);
+    free_acceleration(along);
+    std::copy(p.white_force.begin(), p.white_force.end(), free);
+    p.remove_normal(free);
+    p.unwhiten(free);
+}
+
 void System::normal_part(const double* w, double* out) const {
     projection_->white_project(w, out);
     projection_->unwhiten(out);

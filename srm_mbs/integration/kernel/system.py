@@ -181,6 +181,13 @@ class Evaluator:
             return self.system.residuals(state, t)  # raises the error that says why
         return g[0], c[0]
 
+    def impulse_response(self, q: FloatArray, n: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As :meth:`~srm_mbs.dynamics.multibody.ClosedSystem.impulse_response`."""
+        try:
+            return self.kernel_system.impulse_response(q, n)  # type: ignore[no-any-return]
+        except ArithmeticError:
+            return self.system.impulse_response(q, n)  # raises the error that says why
+
     def branch_nodes(self, norm: ErrorNorm) -> CompiledNodes:
         """Makes the nodes of the motion next to a singular configuration."""
         return CompiledNodes(self.kernel_system, norm)

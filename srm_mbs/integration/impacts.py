@@ -10,6 +10,8 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.integration.kernel.backend import backend
+from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
 from srm_mbs.model.mechanism import per_model
 from srm_mbs.model.numbers import finite_array
 from srm_mbs.model.validation import checked_start
@@ -20,10 +22,18 @@ not let the mechanism move along n."""
 
 
 @per_model
-def _idle_systems(mechanism: Mechanism) -> deque[OpenSystem | ClosedSystem]:
+def _idle_systems(mechanism: Mechanism) -> deque[OpenSystem | ClosedSystem | Evaluator]:
     """The equations of motion that an impact left: their parts that depend on the start do not
     matter to impulses."""
     return deque(maxlen=1)
+
+
+def _make_system(mechanism: Mechanism) -> OpenSystem | ClosedSystem | Evaluator:
+    """The equations of motion, on the kernel if it has closures and is available."""
+    system = make_system(mechanism)
+    if not system.has_constraints or backend() == "python":
+        return system
+    return Evaluator(system, make_kernel_system(system))
 
 
 def impact(
@@ -82,7 +92,7 @@ def impact(
     try:
         system = idle.pop()  # two threads never get the same
     except IndexError:
-        system = make_system(mechanism)
+        system = _make_system(mechanism)
     along, free = system.impulse_response(q, n)
     if mechanism.model.nv <= LARGE:
         idle.append(system)

@@ -768,6 +768,11 @@ class ClosedSystem(Mechanics):
         rows.move_to(t)
         return rows.g.copy(), rows.G @ v - rows.target_rate
 
+    def largest_residuals(self, state: FloatArray, t: float) -> tuple[float, float]:
+        """The largest of :meth:`residuals`, and of their rates."""
+        g, c = (float(np.abs(part).max()) for part in self.residuals(state, t))
+        return g, c
+
 
 def make_system(
     mechanism: Mechanism, controller: Controller | None = None

@@ -97,7 +97,7 @@ def same_time(t: float, t_new: float) -> float:
     return max(SAME_TIME_STEP * (t_new - t), SAME_TIME_ROUNDING * max(abs(t), abs(t_new)))
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False, slots=True)  # not frozen: that would take three times as long
 class EventFunction:
     """An event function and everything that a run needs to know of it.
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Any
 
+from srm_mbs._kernel import core
 from srm_mbs._kernel.workspace import LARGE
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
@@ -28,10 +30,18 @@ def _idle_systems(mechanism: Mechanism) -> deque[OpenSystem | ClosedSystem | Eva
     return deque(maxlen=1)
 
 
+def _share(restitution: Any) -> float | None:
+    """``restitution`` as a number from 0 to 1; None if it is none."""
+    if type(restitution) is not float:
+        found = finite_array(restitution, ())
+        restitution = math.nan if found is None else float(found)
+    return restitution if 0.0 <= restitution <= 1.0 else None
+
+
 def _make_system(mechanism: Mechanism) -> OpenSystem | ClosedSystem | Evaluator:
     """The equations of motion, on the kernel if it has closures and is available."""
     system = make_system(mechanism)
-    if not system.has_constraints or backend() == "python":
+    if core is None or not system.has_constraints:
         return system
     return Evaluator(system, make_kernel_system(system))
 
@@ -68,8 +78,8 @@ def impact(
         If the mass matrix is not positive definite, or a closure has no direction at q.
     """
     check_mechanism(mechanism)
-    share = finite_array(restitution, ())
-    if share is None or not 0.0 <= share <= 1.0:
+    share = _share(restitution)
+    if share is None:
         raise InputError(
             f"restitution = {safe_repr(restitution)} is not between 0 and 1",
             element="restitution",
@@ -93,15 +103,16 @@ def impact(
         system = idle.pop()  # two threads never get the same
     except IndexError:
         system = _make_system(mechanism)
-    along, free = system.impulse_response(q, n)
+    reference = isinstance(system, Evaluator) and backend() == "python"
+    along, free = (system.system if reference else system).impulse_response(q, n)
     if mechanism.model.nv <= LARGE:
         idle.append(system)
-    gain = float(n @ free)
-    if not gain > SMALLEST_GAIN * float(n @ along):
+    gain = float(n.dot(free))
+    if not gain > SMALLEST_GAIN * float(n.dot(along)):
         raise InputError(
             "the closures do not let the mechanism move along this normal",
             element="normal",
             remedy="Give the gradient of the gap, which some motion of the mechanism changes",
         )
-    out: FloatArray = v - (1.0 + float(share)) * float(n @ v) / gain * free
+    out: FloatArray = v - (1.0 + share) * float(n.dot(v)) / gain * free
     return out

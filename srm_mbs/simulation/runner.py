@@ -53,7 +53,7 @@ from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord
 from srm_mbs.integration.kernel.events import CompiledEventWatch
 from srm_mbs.integration.kernel.marshalling import state_from
-from srm_mbs.integration.kernel.observables import closure_errors
+from srm_mbs.integration.kernel.observables import closure_errors, largest_errors
 from srm_mbs.integration.kernel.run import CompiledRun, first_stage
 from srm_mbs.integration.kernel.system import Evaluator, SuccessiveWorkspaces, shared
 from srm_mbs.integration.messages import (
@@ -436,8 +436,15 @@ def _check_errors(
     mechanism: Mechanism, t: float, backend: str, system: OpenSystem | ClosedSystem | None
 ) -> None:
     q0, v0 = mechanism.q0, mechanism.v0
-    start = np.array([t]), q0[None], v0[None]
+    units = mechanism.structure.units
+    unit = constraint_units(mechanism, units)
+    speed = max(units.rate, *np.abs(v0 / units.coordinate).tolist())
     by_kernel = backend in COMPILED and not mechanism.drives
+    if by_kernel:
+        open_by, rate = largest_errors(mechanism, t, q0, v0, unit, system)
+        if open_by <= CONSISTENT and rate <= CONSISTENT * speed:
+            return
+    start = np.array([t]), q0[None], v0[None]
     if by_kernel:
         g, c = (e[0] for e in closure_errors(mechanism, *start, system))
     elif t == 0.0:
@@ -446,9 +453,6 @@ def _check_errors(
         g, c = (e[0] for e in constraint_errors(mechanism, *start))
     if not len(g):
         return
-    units = mechanism.structure.units
-    unit = constraint_units(mechanism, units)
-    speed = max(units.rate, *np.abs(v0 / units.coordinate).tolist())
     for what, values, limit in (("q0", g, CONSISTENT), ("v0", c, CONSISTENT * speed)):
         errors = np.abs(values) / unit
         if max(errors.tolist()) > limit:
@@ -518,7 +522,11 @@ def assemble_problem(
     )
     problem = Problem(mechanism, options, system, norm, state, intervals, by, held, watch, passages)
     problem.code = code
-    if by == "kernel" and options.backend == "auto" and code_is_compiled():
+    if known is not None:
+        measured = known.meter is not None
+    else:
+        measured = by == "kernel" and options.backend == "auto" and code_is_compiled()
+    if measured:
         problem.meter = Meter(mechanism)
     if before is not None:
         problem.stiff = before.end.stiff

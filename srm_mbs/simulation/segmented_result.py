@@ -56,13 +56,14 @@ class SegmentedResult(SimulationResult):
         self._order: IndexArray | slice = slice(None)
         if t_eval is not None:
             self._read_at(t_eval[t_eval <= self.segments[-1].steps.end])
-        self.t_events = self.q_events = self.v_events = None
+        self._events = None
         if first.t_events is not None:
-            count = range(len(first.t_events))
-            self.t_events, self.q_events, self.v_events = (
-                [np.concatenate([getattr(s, name)[i] for s in self.segments]) for i in count]
-                for name in ("t_events", "q_events", "v_events")
+            of_parts = [part._events for part in self.segments if part._events is not None]
+            times, states = (
+                [np.concatenate(parts) for parts in zip(*(events[k] for events in of_parts))]
+                for k in (0, 1)
             )
+            self._events = times, states
 
     @property
     def segments(self) -> tuple[SimulationResult, ...]:

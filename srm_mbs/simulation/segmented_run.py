@@ -337,15 +337,16 @@ def _run_segments(
     at_once: list[Occurrence] = []
     try:
         mechanism, q, v = _at_start(events, mechanism, here, span, at_once)
-        if at_once:
-            here = here._replace(q0=q, v0=v)
+        if not at_once:
+            q, v = here.q0, here.v0
     except EventError as error:
         raise_at_first_call(error, options.t0)
         parts.append(unstarted_segment(mechanism, here, error, types.plain))
         status, message = parts[0].status, parts[0].message
     while status is RunStatus.RUNNING:
         try:
-            asked = here._replace(events=[event.in_segment() for event in events])
+            watched = [event.in_segment() for event in events]
+            asked = here._replace(t0=t, q0=q, v0=v, events=watched)
             segment = run_segment(mechanism, asked, types.plain, workspaces, segment)
             part = segment.result
             part.request = asked.repeatable()
@@ -382,7 +383,6 @@ def _run_segments(
             status = RunStatus.INTERRUPTED
             message = f"Interrupted at t = {t:.6g} s; everything up to there is kept."
         else:
-            here = here._replace(t0=t, q0=q, v0=v)
             status = RunStatus.RUNNING if t_end - t > NEGLIGIBLE_REST * span else RunStatus.FINISHED
         finally:
             if parts and at_once:
@@ -494,11 +494,11 @@ def _closed(system: OpenSystem | ClosedSystem | Evaluator, t: float, x: FloatArr
     A projection would then gain nothing, and next to a singular configuration it would move ``x``
     off its branch by rounding over sigma.
     """
-    if not system.has_constraints:
+    if isinstance(system, OpenSystem) or not system.has_constraints:
         return True
-    g, c = system.residuals(x, t)
-    # Of lists: they are short, and NumPy takes five times as long.
-    error, rate, speed = (max(map(abs, part.tolist())) for part in (g, c, x[system.nq :]))
+    error, rate = system.largest_residuals(x, t)
+    # Of a list: it is short, and NumPy takes five times as long.
+    speed = max(map(abs, x[system.nq :].tolist()))
     return bool(error < CLOSED_ROUNDING and rate < CLOSED_ROUNDING * (1.0 + speed))
 
 

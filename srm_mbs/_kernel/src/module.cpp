@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <map>
 #include <memory>
 #include <string>
 #include <utility>
@@ -222,6 +223,25 @@ struct PySystem {
                                    rates.data() + i * rows);
         return nb::make_tuple(owned_array(std::move(g), {n, rows}),
                               owned_array(std::move(rates), {n, rows}));
+    }
+
+    // The largest |g - s| and |G v - s'| at q (nq,) and v (nv,), over the units (rows,) of the rows.
+    nb::tuple largest_errors(double t, const Array& q, const Array& v, const Array& unit) {
+        const int rows = system->rows();
+        const double* over = vector_of(unit, rows, "unit");
+        const double *from = vector_of(q, system->nq, "q"), *rate = vector_of(v, system->nv, "v");
+        std::vector<double> state(from, from + system->nq), g(rows), rates(rows);
+        state.insert(state.end(), rate, rate + system->nv);
+        system->closure_errors(t, state.data(), g.data(), rates.data());
+        const auto largest = [&](const std::vector<double>& errors) {
+            double out = 0.0;
+            for (int i = 0; i < rows; ++i) {
+                const double error = std::abs(errors[i]) / over[i];
+                if (!(error <= out)) out = error;  // NaN, too
+            }
+            return out;
+        };
+        return nb::make_tuple(largest(g), largest(rates));
     }
 
     // G (n, rows, nv) at the configurations q (n, nq), with drives and -s' as its last column
@@ -545,6 +565,8 @@ void bind_system(nb::module_& m) {
                  s.system->begin_step(t, vector_of(state, s.state_size(), "state"));
              })
         .def("closure_errors", &PySystem::closure_errors)
+        .def("largest_errors", &PySystem::largest_errors, nb::arg("t"), nb::arg("q"), nb::arg("v"),
+             nb::arg("unit"))
         .def("jacobians", &PySystem::jacobians)
         .def("rows_at", &PySystem::rows_at)
         .def("close", &PySystem::close, nb::arg("algebra"), nb::arg("row_unit"), nb::arg("units"),
@@ -574,6 +596,7 @@ void bind_system(nb::module_& m) {
         .def("use_code", &PySystem::use_code, nb::arg("code").none())
         .def("renew", &PySystem::renew, nb::arg("unit"), nb::arg("gap_scale"),
              nb::arg("damping").none(), nb::arg("friction").none())
+        .def("restart", [](PySystem& s) { s.system->restart(); })
         .def_prop_ro("sparse", [](const PySystem& s) { return s.system->sparse(); })
         .def_prop_ro("evaluations", [](const PySystem& s) { return s.system->evaluations; })
         .def_prop_ro("factorisations",
@@ -703,10 +726,17 @@ private:
     }
 };
 
-// Rows (size,) of arrays for functions of the user, which may keep them and write to them.
+// Arrays (size,) for functions of the user, which may keep them and write to them: the next row of a
+// block, because an array of its own costs ten times as much.  With the interpreter's lock held.
 class Rows {
 public:
-    explicit Rows(int size) : size_(static_cast<std::size_t>(size)) {}
+    // Those of all callers; never deleted, because the interpreter may end first.
+    static Rows& of(int size) {
+        static auto& all = *new std::map<int, Rows>;
+        return all.try_emplace(size, size).first->second;
+    }
+
+    explicit Rows(int size) : size_(static_cast<std::size_t>(size)), taken_(many) {}
 
     nb::object next(const double* numbers) {
         if (taken_ == many) {
@@ -720,8 +750,8 @@ public:
     }
 
 private:
-    static constexpr std::size_t many = 32;
-    std::size_t size_, taken_ = many;
+    static constexpr std::size_t many = 64;
+    std::size_t size_, taken_;
     double* first_ = nullptr;
     nb::object block_;
 };
@@ -730,8 +760,8 @@ private:
 class CalledEvent {
 public:
     CalledEvent(nb::handle event, int nq, int nv)
-        : event_(event), function_(event.attr("function").attr("function")), q_(nq), v_(nv),
-          nq_(nq) {}
+        : event_(event), function_(event.attr("function").attr("function")), q_(Rows::of(nq)),
+          v_(Rows::of(nv)), nq_(nq) {}
 
     // The value at t and a state (nx,); raises what EventFunction raises.
     double value(double t, const double* state) {
@@ -755,7 +785,7 @@ public:
 
 private:
     nb::handle event_, function_;
-    Rows q_, v_;
+    Rows &q_, &v_;
     int nq_;
 };
 
@@ -845,12 +875,13 @@ struct PyEventWatch final : EventSearch::Functions {
                               owned_array(std::vector<double>(states.end() - nx, states.end())));
     }
 
-    // Times (k,) and states (k, nx) of the occurrences, for each event.
-    nb::tuple found() const {
+    // Times (k,) and states (k, nx) of the occurrences, for each event; those without any are given.
+    nb::tuple found(const nb::object& no_times, const nb::object& no_states) const {
         nb::list times, states;
         for (std::size_t i = 0; i < called.size(); ++i) {
-            times.append(owned_array(search.times[i]));
-            states.append(owned_array(search.states[i], {search.times[i].size(), nx}));
+            const std::size_t k = search.times[i].size();
+            times.append(k ? owned_array(search.times[i]) : no_times);
+            states.append(k ? owned_array(search.states[i], {k, nx}) : no_states);
         }
         return nb::make_tuple(times, states);
     }
@@ -870,21 +901,23 @@ struct PyRun {
     std::unique_ptr<Run> run;
     const BranchGuard* guard = nullptr;
 
-    // stiff: the scheme where the problem is stiff, if it is another.
+    // stiff: the scheme where the problem is stiff, if it is another.  first_step: of step-size
+    // control (s); 0: what the start allows.
     PyRun(nb::object system_, const ButcherTableau& scheme, const ButcherTableau* stiff,
           const Constants& constants, const ErrorNorm& norm, const IntegratorState& memory,
-          const Array& state, const SmoothIntervals& intervals, const RunOptions& options)
+          const Array& state, const SmoothIntervals& intervals, const RunOptions& options,
+          double t0, double first_step)
         : system(std::move(system_)), s(*nb::cast<PySystem&>(system).system) {
         check_size("ErrorNorm.atol", norm.atol.size());
         check(memory);
         std::vector<double> start = checked_state(state);
         auto control = make_control(scheme, stiff ? *stiff : scheme, constants, norm, memory,
-                                    start, intervals, options);
+                                    start, intervals, options, t0, first_step);
         if (stiff && stiff->stages() != scheme.stages())
             throw nb::value_error("the schemes have other numbers of stages");
         run = std::make_unique<Run>(s, SplitStep(s, scheme, constants, norm), stiff,
                                     std::move(control), memory, std::move(start), intervals,
-                                    options);
+                                    options, t0);
     }
 
     std::unique_ptr<Control> make_control(const ButcherTableau& scheme,
@@ -892,16 +925,17 @@ struct PyRun {
                                           const ErrorNorm& norm, const IntegratorState& memory,
                                           const std::vector<double>& start,
                                           const SmoothIntervals& intervals,
-                                          const RunOptions& options) {
+                                          const RunOptions& options, double t0,
+                                          double first_step) {
         const double t_end = intervals.ends.back();
         std::unique_ptr<Control> control;
         if (options.step > 0.0) {
-            control = std::make_unique<FixedStep>(options.t0, t_end, options.step);
+            control = std::make_unique<FixedStep>(t0, t_end, options.step);
         } else {
-            double first = options.first_step;
+            double first = first_step;
             if (!(first > 0.0))
-                first = initial_step(s, norm, options.t0, start.data(), memory.rate.data(),
-                                     memory.state_scale.data(), t_end - options.t0,
+                first = initial_step(s, norm, t0, start.data(), memory.rate.data(),
+                                     memory.state_scale.data(), t_end - t0,
                                      scheme.controller_order, constants);
             control = std::make_unique<PIControl>(t_end, first, scheme.controller_order,
                                                   stiff.controller_order, constants);
@@ -1126,10 +1160,10 @@ void bind_run(nb::module_& m) {
     nb::class_<PyRun>(m, "Run", nb::type_slots(collected<PyRun, &PyRun::system>()))
         .def(nb::init<nb::object, const ButcherTableau&, const ButcherTableau*, const Constants&,
                       const ErrorNorm&, const IntegratorState&, const Array&,
-                      const SmoothIntervals&, const RunOptions&>(),
+                      const SmoothIntervals&, const RunOptions&, double, double>(),
              nb::arg("system"), nb::arg("scheme"), nb::arg("stiff").none(), nb::arg("constants"),
              nb::arg("norm"), nb::arg("memory"), nb::arg("state"), nb::arg("intervals"),
-             nb::arg("options"), nb::keep_alive<1, 3>(), nb::keep_alive<1, 4>(),
+             nb::arg("options"), nb::arg("t0"), nb::arg("first_step"), nb::keep_alive<1, 3>(), nb::keep_alive<1, 4>(),
              nb::keep_alive<1, 5>(), nb::keep_alive<1, 6>(), nb::keep_alive<1, 10>())
         .def("advance", &PyRun::advance, nb::arg("steps"), nb::arg("seconds"))
         .def("attempt_from", &PyRun::attempt_from)

@@ -461,6 +461,10 @@ void System::renew(std::vector<double> unit, std::vector<double> residual_scale,
     data_.damping = std::move(damping);
     data_.friction = std::move(friction);
     find_friction();
+    restart();
+}
+
+void System::restart() {
     track_laws(false);
     held_from_.clear();
     held_.clear();

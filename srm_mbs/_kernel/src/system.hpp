@@ -172,6 +172,8 @@ public:
     // Resets the system for a run from another start, on which these values depend.
     void renew(std::vector<double> unit, std::vector<double> residual_scale,
                std::vector<double> damping, std::vector<double> friction);
+    // Resets the system for another run from a start that these do not depend on.
+    void restart();
     // Whether `force` (nv,) is the force held last.
     bool holds(const double* force) const;
 

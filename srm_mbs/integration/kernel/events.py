@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
+
+import numpy as np
 
 from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
@@ -40,7 +42,7 @@ class CompiledEventWatch:
     def __init__(
         self, scheme: ButcherTableau, events: Sequence[EventFunction], nq: int, nv: int
     ) -> None:
-        self._events = tuple(events)
+        self._events, self._size = tuple(events), nq + nv
         self._search = core.EventWatch(  # type: ignore[union-attr]
             self._events,
             read_nodes,
@@ -66,7 +68,13 @@ class CompiledEventWatch:
 
     def found(self) -> tuple[list[FloatArray], list[FloatArray]]:
         """As the reference."""
-        return self._search.found()  # type: ignore[no-any-return]
+        return self._search.found(*_nothing(self._size))  # type: ignore[no-any-return]
+
+
+@lru_cache(maxsize=64)
+def _nothing(size: int) -> tuple[FloatArray, FloatArray]:
+    """Times and states of an event that does not occur."""
+    return np.zeros(0), np.zeros((0, size))
 
 
 class _CompiledContactProbe(ContactProbe):

@@ -327,9 +327,7 @@ def collocation_struct(count: int) -> Any:
 @lru_cache(maxsize=64)
 def options_struct(
     *,
-    t0: float,
     step: float | None,
-    first_step: float | None,
     max_step: float,
     placed: str,
     arrivals: bool,
@@ -339,9 +337,7 @@ def options_struct(
 ) -> Any:
     """``RunOptions`` of run.hpp."""
     return _core.RunOptions(
-        t0=t0,
         step=0.0 if step is None else step,
-        first_step=0.0 if first_step is None else float(first_step),
         max_step=max_step,
         placement=placed,
         arrivals=arrivals,
@@ -381,9 +377,7 @@ def dense_constants() -> Any:
 @lru_cache(maxsize=64)
 def scheme_dense(scheme: ButcherTableau) -> Any:
     """``SchemeDense`` of dense.hpp."""
-    return _core.SchemeDense(
-        abscissae=scheme.abscissae, extension=extension_struct(scheme.dense)
-    )
+    return _core.SchemeDense(abscissae=scheme.abscissae, extension=extension_struct(scheme.dense))
 
 
 @lru_cache(maxsize=64)

@@ -88,6 +88,23 @@ def closure_errors(
         return constraint_errors(mechanism, t, q, v)  # raises the error that says why
 
 
+def largest_errors(
+    mechanism: Mechanism,
+    t: float,
+    q: FloatArray,
+    v: FloatArray,
+    unit: FloatArray,
+    system: ClosedSystem | OpenSystem | None = None,
+) -> tuple[float, float]:
+    """The largest errors of :func:`closure_errors` at one state, q (nq,) and v (nv,), and their
+    rates, over the units (rows,) of the rows."""
+    try:
+        with _Lent(_idle_all_rows(mechanism), mechanism, system) as kernel_system:
+            return kernel_system.largest_errors(t, q, v, unit)  # type: ignore[no-any-return]
+    except ArithmeticError:
+        return np.inf, np.inf
+
+
 class CompiledObservables(Observables):
     """:class:`~srm_mbs.dynamics.observables.Observables`, evaluated by the kernel."""
 

@@ -176,9 +176,7 @@ class CompiledRun:
         self.adaptive = step is None
         stiff = method.scheme.stiff
         options = marshalling.options_struct(
-            t0=t0,
             step=step,
-            first_step=first_step,
             max_step=max_step,
             placed=placed,
             arrivals=arrivals,
@@ -196,6 +194,8 @@ class CompiledRun:
             state,
             marshalling.intervals_struct(intervals),
             options,
+            t0,
+            0.0 if first_step is None else float(first_step),
         )
 
     def advance(self, steps: int = 0) -> ReturnReason:

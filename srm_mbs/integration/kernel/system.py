@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from contextlib import ExitStack, suppress
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -106,7 +107,7 @@ class SuccessiveWorkspaces(ExitStack):
     def of(self, system: ClosedSystem | OpenSystem, code: Any) -> Any:
         """That of ``system``, as new; ``code`` as for :func:`make_kernel_system`."""
         if system is self._system:
-            self._kernel_system.renew(**system.constants_of_start())
+            self._kernel_system.restart()
         else:
             self._system = None
             self.close()
@@ -127,6 +128,11 @@ def _idle_or_new(system: ClosedSystem | OpenSystem, code: Any) -> Any:
             kernel_system.use_code(code)
             return kernel_system
     return make_kernel_system(system, code)
+
+
+@lru_cache(maxsize=64)
+def _ones(size: int) -> FloatArray:
+    return np.ones(size)
 
 
 class _KernelTerms:
@@ -173,13 +179,14 @@ class Evaluator:
         self.system.begin_step(t, state)
         self.kernel_system.begin_step(t, state)
 
-    def residuals(self, state: FloatArray, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
-        """As :meth:`~srm_mbs.dynamics.multibody.ClosedSystem.residuals`."""
+    def largest_residuals(self, state: FloatArray, t: float) -> tuple[float, float]:
+        """As :meth:`~srm_mbs.dynamics.multibody.ClosedSystem.largest_residuals`."""
+        q, v = self.system.split(state)
         try:
-            g, c = self.kernel_system.closure_errors(np.array([t]), state[None])
+            unit = _ones(len(self.system.residual_scale))
+            return self.kernel_system.largest_errors(t, q, v, unit)  # type: ignore[no-any-return]
         except ArithmeticError:
-            return self.system.residuals(state, t)  # raises the error that says why
-        return g[0], c[0]
+            return self.system.largest_residuals(state, t)  # raises the error that says why
 
     def impulse_response(self, q: FloatArray, n: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As :meth:`~srm_mbs.dynamics.multibody.ClosedSystem.impulse_response`."""

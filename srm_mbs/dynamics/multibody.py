@@ -542,6 +542,10 @@ class OpenSystem(Mechanics):
         """Two empty arrays: there is no closure."""
         return np.zeros(0), np.zeros(0)
 
+    def largest_residuals(self, state: FloatArray, t: float) -> tuple[float, float]:
+        """Zeros: there is no closure."""
+        return 0.0, 0.0
+
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
         """v' = aba(q, v, tau); see :class:`~srm_mbs.dynamics.system.System`."""
         self.evaluations += 1

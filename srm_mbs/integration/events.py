@@ -77,9 +77,12 @@ StateFunction = Callable[[float, FloatArray], Any]
 
 
 class MechanismFunction:
-    """The ``function`` of (t, q, v) as one of (t, state), which can be pickled; ``nq``: length of q.
+    """A function of (t, state) that can be pickled, from one of (t, q, v) and the length of q.
 
-    The compiled kernel calls ``function`` itself.
+    Attributes
+    ----------
+    function
+        That of (t, q, v), which the compiled kernel calls itself.
     """
 
     __slots__ = ("_q", "_v", "function")
@@ -157,7 +160,7 @@ class EventFunction:
         return self.number(found, t)
 
     def number(self, found: Any, t: float) -> float:
-        """What the function returned at ``t`` (s) as a float.
+        """The value ``found`` that the function returned at ``t`` (s), as a float.
 
         Raises
         ------

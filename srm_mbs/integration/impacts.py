@@ -103,8 +103,10 @@ def impact(
         system = idle.pop()  # two threads never get the same
     except IndexError:
         system = _make_system(mechanism)
-    reference = isinstance(system, Evaluator) and backend() == "python"
-    along, free = (system.system if reference else system).impulse_response(q, n)
+    used = system
+    if isinstance(system, Evaluator) and backend() == "python":
+        used = system.system
+    along, free = used.impulse_response(q, n)
     if mechanism.model.nv <= LARGE:
         idle.append(system)
     gain = float(n.dot(free))

@@ -539,7 +539,7 @@ def assemble_problem(
 
 
 def _repeated_step(end: EndOfSteps) -> float:
-    """The first step (s) of the segment after one with that ``end``; 0: as at the start of a run."""
+    """The first step (s) of the segment after one with that ``end``; 0: that of a run's start."""
     longest = LONGEST_REPEATED * (end.time - end.start)
     last = end.last_time - end.last_start
     return min(last, longest) if longest > SHORTEST_REPEATED * last else 0.0
@@ -655,7 +655,7 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
             norm,
             memory,
             state,
-            problem.watch,
+            cast(EventWatch | None, problem.watch),
             handler,
             problem.passages,
             sink=problem.stream,

@@ -494,8 +494,6 @@ def _closed(system: OpenSystem | ClosedSystem | Evaluator, t: float, x: FloatArr
     A projection would then gain nothing, and next to a singular configuration it would move ``x``
     off its branch by rounding over sigma.
     """
-    if isinstance(system, OpenSystem) or not system.has_constraints:
-        return True
     error, rate = system.largest_residuals(x, t)
     # Of a list: it is short, and NumPy takes five times as long.
     speed = max(map(abs, x[system.nq :].tolist()))

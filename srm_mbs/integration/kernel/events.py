@@ -84,7 +84,7 @@ class _CompiledContactProbe(ContactProbe):
         self, evaluator: Evaluator, units: Units, span: float, t: float, state: FloatArray
     ) -> None:
         super().__init__(evaluator.system, units, span, t, state)
-        self._kernel_system = evaluator.kernel_system
+        self._kernel_system, self._nq = evaluator.kernel_system, evaluator.system.nq
         self._arguments = evaluator.system, units, span, t, state
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -104,7 +104,8 @@ class _CompiledContactProbe(ContactProbe):
     def _values(
         self, event: EventFunction, times: Sequence[float], states: FloatArray
     ) -> list[float]:
-        return core.event_values(event, self._system.nq, times, states)  # type: ignore[union-attr]
+        found: list[float] = core.event_values(event, self._nq, times, states)  # type: ignore[union-attr]
+        return found
 
 
 def contact_probe(

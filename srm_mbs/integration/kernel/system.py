@@ -181,12 +181,12 @@ class Evaluator:
 
     def largest_residuals(self, state: FloatArray, t: float) -> tuple[float, float]:
         """As :meth:`~srm_mbs.dynamics.multibody.ClosedSystem.largest_residuals`."""
-        q, v = self.system.split(state)
-        try:
-            unit = _ones(len(self.system.residual_scale))
-            return self.kernel_system.largest_errors(t, q, v, unit)  # type: ignore[no-any-return]
-        except ArithmeticError:
-            return self.system.largest_residuals(state, t)  # raises the error that says why
+        system = self.system
+        if not isinstance(system, OpenSystem):
+            with suppress(ArithmeticError):  # the reference raises the error that says why
+                unit = _ones(len(system.residual_scale))
+                return self.kernel_system.largest_errors(t, *system.split(state), unit)  # type: ignore[no-any-return]
+        return system.largest_residuals(state, t)
 
     def impulse_response(self, q: FloatArray, n: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As :meth:`~srm_mbs.dynamics.multibody.ClosedSystem.impulse_response`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -68,7 +69,7 @@ def test_the_kernel_finds_the_events_of_steps_as_the_reference_does(
         for watch, states in watches:
             watch.begin(0.0, dense([0.0])[0])
             found = None
-            for t, t_new in zip(ends, ends[1:]):
+            for t, t_new in pairwise(ends):
                 start, end = dense([t, t_new])
                 found = found or watch.after_step(t, start, t_new, end, states)
             stops.append(found and (found.time, found.message, found.state.tolist()))

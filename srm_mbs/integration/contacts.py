@@ -14,8 +14,8 @@ rounding of the value, its change when time and state change by rounding, are ze
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,8 +36,7 @@ RESTING_SHARE = 1e-3
 """e' d, over e'' d^2 / 2, below which a contact rests: an action may leave that much of a rate."""
 
 
-@dataclass(frozen=True)
-class Contact:
+class Contact(NamedTuple):
     """A contact that touches.
 
     Attributes

@@ -41,7 +41,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -282,8 +282,7 @@ def sign_above(value: float, floor: float) -> float:
     return 0.0 if abs(value) <= floor else math.copysign(1.0, value)
 
 
-@dataclass(frozen=True)
-class Occurrence:
+class Occurrence(NamedTuple):
     """An occurrence of an event: its index among the events, its time (s) and state (nx,)."""
 
     event: int
@@ -297,8 +296,7 @@ def stop_message(name: str, count: int, t: float) -> str:
     return f"The event {name}{which} ended the run at t = {t:.9g} s."
 
 
-@dataclass(frozen=True)
-class Stop:
+class Stop(NamedTuple):
     """The end of a run by a terminal event: its time (s) and state (nx,), and a sentence that
     names it."""
 

@@ -182,7 +182,7 @@ class Problem:
     meter: Meter | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Segment(Generic[Result]):
     """A segment of a run, between the actions of events.
 

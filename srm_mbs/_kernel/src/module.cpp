@@ -741,8 +741,11 @@ public:
     nb::object next(const double* numbers) {
         if (taken_ == many) {
             std::vector<double> values(many * size_);
-            first_ = values.data();
-            block_ = owned_array(std::move(values), {many, size_});
+            double* const first = values.data();
+            nb::object block = owned_array(std::move(values), {many, size_});
+            // Now, because that may collect garbage, whose finalizers may come here.
+            first_ = first;
+            block_ = std::move(block);
             taken_ = 0;
         }
         std::copy_n(numbers, size_, first_ + taken_ * size_);

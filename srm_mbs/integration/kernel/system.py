@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from contextlib import ExitStack, suppress
 from functools import lru_cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -182,9 +182,9 @@ class Evaluator:
     def largest_residuals(self, state: FloatArray, t: float) -> tuple[float, float]:
         """As :meth:`~srm_mbs.dynamics.multibody.ClosedSystem.largest_residuals`."""
         system = self.system
-        if not isinstance(system, OpenSystem):
+        if system.has_constraints:
             with suppress(ArithmeticError):  # the reference raises the error that says why
-                unit = _ones(len(system.residual_scale))
+                unit = _ones(len(cast(ClosedSystem, system).residual_scale))
                 return self.kernel_system.largest_errors(t, *system.split(state), unit)  # type: ignore[no-any-return]
         return system.largest_residuals(state, t)
 

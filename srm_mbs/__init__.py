@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from srm_mbs.api import DaeSolution, Solution, compile, load_solution, simulate, solve_dae
     from srm_mbs.assembly.assemble import Assembly, assemble
     from srm_mbs.dynamics.actuation import actuator_controller
-    from srm_mbs.dynamics.impacts import impact
     from srm_mbs.dynamics.mechanism import Mechanism
     from srm_mbs.errors import (
         AnalysisError,
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     from srm_mbs.formats.convert import convert
     from srm_mbs.formats.load import bundled_models, load, n_four_bar
     from srm_mbs.formats.planar.linkage import Linkage, planar
+    from srm_mbs.integration.impacts import impact
     from srm_mbs.integration.kernel.backend import backend
     from srm_mbs.integration.methods.butcher import ButcherTableau
     from srm_mbs.integration.methods.psrm import PSRM
@@ -82,13 +82,13 @@ _NAMES = {
     "api": "DaeSolution Solution compile load_solution simulate solve_dae",
     "assembly.assemble": "Assembly assemble",
     "dynamics.actuation": "actuator_controller",
-    "dynamics.impacts": "impact",
     "dynamics.mechanism": "Mechanism",
     "errors": "__version__ AnalysisError AssemblyError InputError SimulationError SrmError "
     "SrmWarning",
     "formats.convert": "convert",
     "formats.load": "bundled_models load n_four_bar",
     "formats.planar.linkage": "Linkage planar",
+    "integration.impacts": "impact",
     "integration.kernel.backend": "backend",
     "integration.methods.butcher": "ButcherTableau",
     "integration.methods.psrm": "PSRM",

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from math import copysign, inf, pi, sqrt, tanh
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -53,6 +52,7 @@ from srm_mbs.model.forces import (
     Wrench,
 )
 from srm_mbs.model.laws import Law
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import FRICTION_SPEED, MechanismData, per_model
 
 

@@ -557,6 +557,10 @@ class OpenSystem(Mechanics):
         """Two empty arrays: there is no closure."""
         return np.zeros(0), np.zeros(0)
 
+    def largest_residuals(self, state: FloatArray, t: float) -> tuple[float, float]:
+        """Zeros: there is no closure."""
+        return 0.0, 0.0
+
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Terms:
         """v' = aba(q, v, tau); see :class:`~srm_mbs.dynamics.system.System`."""
         self.evaluations += 1
@@ -778,6 +782,11 @@ class ClosedSystem(Mechanics):
         rows.evaluate(self.model, self.data, q)
         rows.move_to(t)
         return rows.g.copy(), rows.G @ v - rows.target_rate
+
+    def largest_residuals(self, state: FloatArray, t: float) -> tuple[float, float]:
+        """The largest of :meth:`residuals`, and of their rates."""
+        g, c = (float(np.abs(part).max()) for part in self.residuals(state, t))
+        return g, c
 
 
 def make_system(

@@ -34,7 +34,7 @@ REPEATED_SEARCH_SIGMA = 0.5
 FIRST_STAGE_ERROR = 0.1
 """Part of the tolerance that rounding in the first stage of a smooth interval may take."""
 
-_UNBOUNDED = np.array([np.inf])
+_UNBOUNDED, _MINUS_UNBOUNDED = np.array([np.inf]), np.array([-np.inf])
 _NONE = np.zeros(0, dtype=bool)
 
 
@@ -62,10 +62,15 @@ class SmoothIntervals:
         """Number of intervals."""
         return len(self.ends)
 
+    @property
+    def unbroken(self) -> bool:
+        """Whether there are no breakpoints, at the ends of the run neither."""
+        return self.first is _MINUS_UNBOUNDED and self.last is _UNBOUNDED
+
 
 @lru_cache(maxsize=64)
 def _single_interval(t_end: float) -> SmoothIntervals:
-    return SmoothIntervals(np.array([t_end]), -_UNBOUNDED, _UNBOUNDED, _NONE)
+    return SmoothIntervals(np.array([t_end]), _MINUS_UNBOUNDED, _UNBOUNDED, _NONE)
 
 
 def smooth_intervals(

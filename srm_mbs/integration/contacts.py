@@ -13,8 +13,9 @@ rounding of the value, its change when time and state change by rounding, are ze
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from srm_mbs.dynamics.system import System
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.events import EventFunction
 from srm_mbs.integration.methods.near_singular import LARGEST_ZONE_SIGMA
+from srm_mbs.model.lazy import cached_property
 
 VALUE_ROUNDING = 64.0 * float(np.finfo(float).eps)
 """Change of time and state, over their sizes and units, by which the rounding of a value is
@@ -35,8 +37,7 @@ RESTING_SHARE = 1e-3
 """e' d, over e'' d^2 / 2, below which a contact rests: an action may leave that much of a rate."""
 
 
-@dataclass(frozen=True)
-class Contact:
+class Contact(NamedTuple):
     """A contact that touches.
 
     Attributes
@@ -82,23 +83,37 @@ class ContactProbe:
         EventError
             If the event function fails; so does :meth:`contact`.
         """
-        return _largest_change(event, t, self._rounded(state), event(t, state.copy()))
+        return self._rounded_value(event, t, self._rounded(state))[1]
 
-    def _rounded(self, state: FloatArray) -> list[FloatArray]:
-        """``state`` changed by rounding in several directions."""
+    def _rounded_value(
+        self, event: EventFunction, t: float, states: FloatArray
+    ) -> tuple[float, float]:
+        """The value of ``event`` at ``t`` (s) and the first of ``states``, and its largest change
+        when ``t`` and the state change by rounding, to the others."""
+        times = [t, *[t * (1.0 - VALUE_ROUNDING)] * (len(states) - 1)]
+        value, *others = self._values(event, times, states)
+        return value, max([abs(other - value) for other in others])
+
+    def _values(
+        self, event: EventFunction, times: Sequence[float], states: FloatArray
+    ) -> list[float]:
+        return [event(t, x.copy()) for t, x in zip(times, states)]
+
+    def _rounded(self, state: FloatArray) -> FloatArray:
+        """``state``, and it changed by rounding in several directions (1 + k, nx)."""
         size, retract = self._scale.size, self._system.retract
-        changes = _changes(max(size, state.size))
+        changes = rounding_changes(max(size, state.size))
         scaled = state * (1.0 + changes[:, : state.size])
-        return list(map(retract, scaled, self._scale * changes[:, :size]))
+        return np.array([state, *map(retract, scaled, self._scale * changes[:, :size])])
 
     @cached_property
-    def _beside(self) -> list[FloatArray]:
+    def _beside(self) -> FloatArray:
         return self._rounded(self._state)
 
     @cached_property
-    def _ahead(self) -> list[tuple[float, FloatArray]]:
-        """The two times (s), and the states there, of the motion from here; without acceleration
-        where that cannot be evaluated, or is not accurate, next to a singular configuration."""
+    def _ahead(self) -> FloatArray:
+        """States (2, nx) of the motion from here; without acceleration where that cannot be
+        evaluated, or is not accurate, next to a singular configuration."""
         t, state, system = self._t, self._state, self._system
         nv, retract = system.multiplier_size, system.retract
         v, a = state[-nv:], np.zeros(nv)
@@ -108,10 +123,12 @@ class ContactProbe:
                 a = terms.rate()[nv:]
         except EvaluationError:
             pass
-        return [
-            (t + d, retract(state, np.concatenate([d * v + 0.5 * d**2 * a, d * a])))
-            for d in (self._time, 2.0 * self._time)
-        ]
+        return np.array(
+            [
+                retract(state, np.concatenate([d * v + 0.5 * d**2 * a, d * a]))
+                for d in (self._time, 2.0 * self._time)
+            ]
+        )
 
     def contact(
         self, event: EventFunction, zero: float, slack: float, floor: float
@@ -125,12 +142,14 @@ class ContactProbe:
         floor
             Size of changes that are rounding, whatever the rounding of the value.
         """
-        value = event(self._t, self._state.copy())
-        rounding = max(_largest_change(event, self._t, self._beside, value), floor)
+        t = self._t
+        value, rounding = self._rounded_value(event, t, self._beside)
+        rounding = max(rounding, floor)
         forbidden = event.direction * value > 0.0
         if abs(value) > max(rounding, zero, slack if forbidden else 0.0):
             return None
-        near, far = (event(t, x.copy()) - value for t, x in self._ahead)
+        near, far = self._values(event, (t + self._time, t + 2.0 * self._time), self._ahead)
+        near, far = near - value, far - value
         first, second = 2.0 * near - 0.5 * far, 0.5 * far - near
         allowed = -1.0 if event.direction > 0.0 else 1.0
         resting = max(rounding, RESTING_SHARE * abs(second))
@@ -139,17 +158,8 @@ class ContactProbe:
         return Contact(rate or departs, rate)
 
 
-def _largest_change(
-    event: EventFunction, t: float, rounded: list[FloatArray], value: float
-) -> float:
-    """The largest change of the ``value`` of ``event`` when ``t`` (s) and the state change by
-    rounding."""
-    early = t * (1.0 - VALUE_ROUNDING)
-    return max([abs(event(early, x.copy()) - value) for x in rounded])
-
-
 @lru_cache(maxsize=64)
-def _changes(size: int) -> FloatArray:
+def rounding_changes(size: int) -> FloatArray:
     """Relative changes (k, size) by rounding; any two numbers change apart in one of the rows."""
     numbers = np.arange(size)
     bits = range(max(size - 1, 1).bit_length())

@@ -73,6 +73,30 @@ class Attempt(NamedTuple):
     decision: StepDecision
 
 
+class EndOfSteps(NamedTuple):
+    """How the steps of a run end, of one whose steps no :class:`StepSink` took.
+
+    Attributes
+    ----------
+    start
+        Start of the run (s).
+    last_start, last_time
+        Start and end of the last step (s); both the start of the run without any.
+    time, state
+        End of the run (s), in the last step where a terminal event ended it, and the state there
+        (nx,); None where the dense output has to find it.
+    stiff
+        Whether the last step was stiff.
+    """
+
+    start: float
+    last_start: float
+    last_time: float
+    time: float
+    state: FloatArray | None
+    stiff: bool
+
+
 @dataclass
 class RunRecord:
     """Everything a run produced, complete at any moment it is stopped.
@@ -209,6 +233,16 @@ class RunRecord:
         if self.steps:
             return self.steps[-1].state
         return self.x0 if self.rest is None else self.rest[1]
+
+    def end_of_steps(self) -> EndOfSteps:
+        """The end of the steps."""
+        if not self.steps:
+            return EndOfSteps(self.t0, self.t0, self.t0, self.t0, None, False)
+        last = self.steps[-1]
+        # The dense output of a single step is that in which the event was found.
+        state = self.stop_state if self.made == 1 else None
+        time = self.times[-1] if self.stop is None else self.stop
+        return EndOfSteps(self.t0, last.t, self.times[-1], time, state, last.stiff)
 
     def close(self) -> None:
         """Let go of the steps, which arrays have, and of what made them."""

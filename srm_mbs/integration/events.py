@@ -41,7 +41,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -76,12 +76,31 @@ StateFunction = Callable[[float, FloatArray], Any]
 """(t, state) -> a float that passes zero at the event."""
 
 
+class MechanismFunction:
+    """A function of (t, state) that can be pickled, from one of (t, q, v) and the length of q.
+
+    Attributes
+    ----------
+    function
+        That of (t, q, v), which the compiled kernel calls itself.
+    """
+
+    __slots__ = ("_q", "_v", "function")
+
+    def __init__(self, function: Callable[[float, FloatArray, FloatArray], Any], nq: int) -> None:
+        self.function = function
+        self._q, self._v = slice(None, nq), slice(nq, None)
+
+    def __call__(self, t: float, state: FloatArray) -> Any:
+        return self.function(t, state[self._q], state[self._v])
+
+
 def same_time(t: float, t_new: float) -> float:
     """Distance (s) below which two times within the step from ``t`` to ``t_new`` are one."""
     return max(SAME_TIME_STEP * (t_new - t), SAME_TIME_ROUNDING * max(abs(t), abs(t_new)))
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False, slots=True)  # not frozen: that would take three times as long
 class EventFunction:
     """An event function and everything that a run needs to know of it.
 
@@ -134,13 +153,24 @@ class EventFunction:
         """
         try:
             found = self.function(t, state)
-            if isinstance(found, float) and math.isfinite(found):
-                return float(found)
+        except Exception as error:
+            self.fail(error, t)
+        if isinstance(found, float) and math.isfinite(found):
+            return float(found)
+        return self.number(found, t)
+
+    def number(self, found: Any, t: float) -> float:
+        """The value ``found`` that the function returned at ``t`` (s), as a float.
+
+        Raises
+        ------
+        EventError
+            If it is anything but one finite number.
+        """
+        try:
             value = np.asarray(found, dtype=float)
         except Exception as error:
-            raise EventError(
-                f"the event {self.name} raised {safe_repr(error)} at t = {t:.6g} s", t
-            ) from error
+            self.fail(error, t)
         if value.size != 1 or not np.isfinite(value).all():
             raise EventError(
                 f"the event {self.name} returned {value.tolist()} at t = {t:.6g} s; "
@@ -148,6 +178,12 @@ class EventFunction:
                 t,
             )
         return float(value.item())
+
+    def fail(self, error: Exception, t: float) -> NoReturn:
+        """Raise the EventError of a function that raised ``error`` at ``t`` (s)."""
+        raise EventError(
+            f"the event {self.name} raised {safe_repr(error)} at t = {t:.6g} s", t
+        ) from error
 
     def floor_at(self, t: float, state: FloatArray) -> float:
         """Size of values that count as zero at ``t`` (s) and ``state``."""
@@ -246,8 +282,7 @@ def sign_above(value: float, floor: float) -> float:
     return 0.0 if abs(value) <= floor else math.copysign(1.0, value)
 
 
-@dataclass(frozen=True)
-class Occurrence:
+class Occurrence(NamedTuple):
     """An occurrence of an event: its index among the events, its time (s) and state (nx,)."""
 
     event: int
@@ -261,8 +296,7 @@ def stop_message(name: str, count: int, t: float) -> str:
     return f"The event {name}{which} ended the run at t = {t:.9g} s."
 
 
-@dataclass(frozen=True)
-class Stop:
+class Stop(NamedTuple):
     """The end of a run by a terminal event: its time (s) and state (nx,), and a sentence that
     names it."""
 
@@ -298,7 +332,7 @@ class EventWatch:
 
     def __init__(self, scheme: ButcherTableau, events: Sequence[EventFunction], size: int) -> None:
         self._events = tuple(events)
-        self._fractions = _fractions(len(scheme.dense.rows))
+        self._fractions = examined_fractions(scheme)
         self._values = [0.0] * len(self._events)
         # The sign last seen; 0 after a value that was exactly zero.
         self._signs = [0.0] * len(self._events)
@@ -339,10 +373,7 @@ class EventWatch:
         """
         inside = t + self._fractions * (t_new - t)
         times = [*inside.tolist(), t_new]
-        try:
-            states = np.concatenate([dense(inside), end[None]])
-        except EvaluationError as error:
-            raise EventError(f"no event could be looked for within a step: {error}") from error
+        states = np.concatenate([read_nodes(dense, inside), end[None]])
         found: list[tuple[float, int]] = []
         for i, event in enumerate(self._events):
             values = [event(at, x) for at, x in zip(times, states.copy())]
@@ -429,9 +460,23 @@ class EventWatch:
 
 
 @lru_cache(maxsize=8)
-def _fractions(parts: int) -> FloatArray:
-    """Where a step is examined inside, over its length, if that is divided into ``parts``."""
-    return np.linspace(0.0, 1.0, parts + 1)[1:-1]
+def examined_fractions(scheme: ButcherTableau) -> FloatArray:
+    """Where a step is examined inside, over its length."""
+    return np.linspace(0.0, 1.0, len(scheme.dense.rows) + 1)[1:-1]
+
+
+def read_nodes(dense: StepDense, times: FloatArray) -> FloatArray:
+    """States (k, nx) at ``times`` (k,) s at which a step is examined.
+
+    Raises
+    ------
+    EventError
+        If one cannot be evaluated.
+    """
+    try:
+        return dense(times)
+    except EvaluationError as error:
+        raise EventError(f"no event could be looked for within a step: {error}") from error
 
 
 def _value_at(event: EventFunction, dense: StepDense, t: float) -> float:

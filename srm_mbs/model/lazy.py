@@ -14,9 +14,9 @@ if TYPE_CHECKING or sys.version_info >= (3, 12):
 else:
 
     class cached_property(functools.cached_property):  # noqa: N801 - a decorator
-        """As that of Python 3.12, without the lock of Python 3.11, which all instances share while a
-        value is computed and which costs more than most of the values.  Two threads that read one
-        for the first time may both compute it."""
+        """As that of Python 3.12, without the lock of Python 3.11: all instances share it while a
+        value is computed, and it costs more than most of the values.  Two threads that read one for
+        the first time may both compute it."""
 
         def __get__(self, instance: Any, owner: type[Any] | None = None) -> Any:
             if instance is None:

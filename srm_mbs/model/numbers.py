@@ -33,7 +33,7 @@ def finite_array(
     new
         Whether it is a copy, which changes of ``values`` do not reach.
     """
-    if type(values) is np.ndarray and values.dtype == float and values.shape == shape:
+    if type(values) is np.ndarray and values.dtype == float and shape in (None, values.shape):
         return (values.copy() if new else values) if _all_finite(values) else None
     try:
         given = np.asarray(values)

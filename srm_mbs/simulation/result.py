@@ -278,10 +278,7 @@ class SimulationResult(RunOutcome):
         self.t_eval = t_eval
         if t_eval is not None:
             _ = self._nodes  # what cannot be evaluated is an error here
-        self.t_events: list[FloatArray] | None = None
-        self.q_events: list[FloatArray] | None = None
-        self.v_events: list[FloatArray] | None = None
-        self._take_events(events)
+        self._events = events
 
     @cached_property
     def attempts(self) -> NDArray[np.void]:  # type: ignore[override]
@@ -338,14 +335,23 @@ class SimulationResult(RunOutcome):
         last: FloatArray = self._nodes[1][-1]
         return last
 
-    def _take_events(self, events: tuple[list[FloatArray], list[FloatArray]] | None) -> None:
-        """Times and states of the occurrences of each event."""
-        self._events = events
-        if events is not None:
-            nq = self.mechanism.model.nq
-            self.t_events, found = events
-            self.q_events = [states[:, :nq] for states in found]
-            self.v_events = [states[:, nq:] for states in found]
+    @property
+    def t_events(self) -> list[FloatArray] | None:
+        """Times (k,) s of each event; None if no events were given."""
+        return None if self._events is None else self._events[0]
+
+    @property
+    def q_events(self) -> list[FloatArray] | None:
+        """Configurations (k, nq) at these times."""
+        return self._columns_of_events(slice(None, self.mechanism.model.nq))
+
+    @property
+    def v_events(self) -> list[FloatArray] | None:
+        """Velocities (k, nv) at these times."""
+        return self._columns_of_events(slice(self.mechanism.model.nq, None))
+
+    def _columns_of_events(self, columns: slice) -> list[FloatArray] | None:
+        return None if self._events is None else [x[:, columns] for x in self._events[1]]
 
     def add_occurrences(self, occurrences: Sequence[Occurrence]) -> None:
         """Add ``occurrences`` of events at the start or the end of the run."""
@@ -358,7 +364,7 @@ class SimulationResult(RunOutcome):
             order = np.argsort(times[i], kind="stable")
             times[i] = times[i][order]
             states[i] = np.concatenate([states[i], found.state[None]])[order]
-        self._take_events((times, states))
+        self._events = times, states
 
     @property
     def steps(self) -> StepData:  # type: ignore[override]

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,13 +44,14 @@ from srm_mbs.integration.control.step_size import (
 )
 from srm_mbs.integration.critical_passages import CriticalPassages, examined_passages
 from srm_mbs.integration.dense_output import DenseOutput, StepData
-from srm_mbs.integration.driver import RunRecord, RunStatus, StepSink
-from srm_mbs.integration.events import EventWatch, StateFunction, prepare_events
+from srm_mbs.integration.driver import EndOfSteps, RunRecord, RunStatus, StepSink
+from srm_mbs.integration.events import EventWatch, MechanismFunction, prepare_events
 from srm_mbs.integration.generated.policy import Meter, code_of_run
 from srm_mbs.integration.kernel import driver as kernel_driver
 from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend, code_is_compiled
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord, StepSummary
+from srm_mbs.integration.kernel.events import CompiledEventWatch
 from srm_mbs.integration.kernel.marshalling import state_from
 from srm_mbs.integration.kernel.observables import closure_errors, largest_errors
 from srm_mbs.integration.kernel.run import CompiledRun, first_stage
@@ -176,7 +177,7 @@ class Problem:
     intervals: SmoothIntervals
     backend: str
     held: HeldForce | None
-    watch: EventWatch | None
+    watch: EventWatch | CompiledEventWatch | None
     passages: CriticalPassages | None
     held_watch: HeldForceWatch | None = None
     stream: OutputStream | None = None
@@ -186,13 +187,36 @@ class Problem:
     meter: Meter | None = None
 
 
+@dataclass(eq=False, slots=True)
+class Segment(Generic[Result]):
+    """A segment of a run, between the actions of events.
+
+    Attributes
+    ----------
+    problem, result
+        What was asked for, and the result.
+    end
+        The end of its steps.
+    """
+
+    problem: Problem
+    result: Result
+    end: EndOfSteps
+
+    @property
+    def last_state(self) -> FloatArray:
+        """q and v (nq + nv,) at its end."""
+        state = self.end.state
+        return self.result.last_state if state is None else state
+
+
 def run_segment(
     mechanism: Mechanism,
     options: RunOptions,
     result_type: type[Result],
     workspaces: SuccessiveWorkspaces,
-    before: SimulationResult | None = None,
-) -> Result:
+    before: Segment[Result] | None = None,
+) -> Segment[Result]:
     """A segment of a run, between the actions of events.
 
     Parameters
@@ -213,15 +237,16 @@ def run_segment(
     if before is None:
         raise_at_first_call(record.error, options.t0)
     lead_with_cause(problem, record)
+    end = record.end_of_steps()
     result = assemble_result(problem, record, counters, kernel_system, result_type)
     log_end(mechanism.name, result)
-    return result
+    return Segment(problem, result, end)
 
 
 def run_whole(mechanism: Mechanism, options: RunOptions, result_type: type[Result]) -> Result:
     """A run without event actions; the parameters are those of :func:`run_segment`."""
     with SuccessiveWorkspaces() as workspaces:
-        return run_segment(mechanism, options, result_type, workspaces)
+        return run_segment(mechanism, options, result_type, workspaces).result
 
 
 def lead_with_cause(problem: Problem, record: RunRecord) -> None:
@@ -451,7 +476,7 @@ def _check_errors(
 
 
 def assemble_problem(
-    mechanism: Mechanism, options: RunOptions, before: SimulationResult | None = None
+    mechanism: Mechanism, options: RunOptions, before: Segment[Result] | None = None
 ) -> Problem:
     """The problem of a run of ``mechanism``; ``before`` as for :func:`run_segment`.
 
@@ -461,52 +486,69 @@ def assemble_problem(
         If the start is inconsistent, a law does not cover the run, or the backend cannot make it.
     """
     t0, t_end, method = options.t0, options.t_end, options.method
-    samples = checked_samples(options.sample_time, options.controller, t0, t_end)
-    times = checked_breakpoints(options.breakpoints)
-    own = mechanism.breakpoints(t0, t_end)
-    intervals = smooth_intervals(np.append(times, own) if own else times, samples, t0, t_end)
-    check_avoidable(options.singular_times, intervals.ends, t_end - t0)
-    if before is None:
-        by = chosen_backend(options.backend, method, options.placement, options.singular_times)
-    else:
-        by = before.backend
-    by, code = code_of_run(by, options.backend, mechanism)
-    mechanism, state = initial_state(mechanism, t0, options.q0, options.v0)
-    norm = error_norm(mechanism, options)
     held = None if options.sample_time is None else HeldForce()
-    last_step = 0.0
-    if before is not None and held is None and before.mechanism.structure is mechanism.structure:
-        start, end = before.span
-        last_step, longest = before.steps.last_length, LONGEST_REPEATED * (end - start)
-        last_step = min(last_step, longest) if longest > SHORTEST_REPEATED * last_step else 0.0
-        system = before.system
+    known = None if before is None or held is not None else before.problem
+    if known is not None and known.mechanism.structure is not mechanism.structure:
+        known = None
+    if known is not None and known.intervals.unbroken:
+        intervals = known.intervals
+    else:
+        samples = checked_samples(options.sample_time, options.controller, t0, t_end)
+        given = checked_breakpoints(options.breakpoints)
+        own = mechanism.breakpoints(t0, t_end)
+        intervals = smooth_intervals(np.append(given, own) if own else given, samples, t0, t_end)
+        check_avoidable(options.singular_times, intervals.ends, t_end - t0)
+    if known is not None:
+        by, code = known.backend, known.code
+    elif before is not None:
+        by, code = code_of_run(before.problem.backend, options.backend, mechanism)
+    else:
+        by = chosen_backend(options.backend, method, options.placement, options.singular_times)
+        by, code = code_of_run(by, options.backend, mechanism)
+    mechanism, state = initial_state(mechanism, t0, options.q0, options.v0)
+    if known is not None:
+        system, norm = known.system, known.norm
         system.restart()
     else:
         system = make_system(mechanism, options.controller if held is None else held)
-    mechanism.check_covers(t_end)
+        norm = error_norm(mechanism, options)
+        mechanism.check_covers(t_end)
     if mechanism.constrained:
         check_consistent(mechanism, t0, by, system)
-    watch = None
+    watch: EventWatch | CompiledEventWatch | None = None
     if options.events is not None:
-        nq = mechanism.model.nq
-
-        def adapt(event: Callable[..., Any]) -> StateFunction:
-            return lambda t, x: event(t, x[:nq], x[nq:])
-
-        watch = EventWatch(method.scheme, prepare_events(options.events, adapt), state.size)
+        nq, nv = system.nq, system.nv
+        events = prepare_events(options.events, lambda event: MechanismFunction(event, nq))
+        if by in COMPILED:
+            watch = CompiledEventWatch(method.scheme, events, nq, nv)
+        else:
+            watch = EventWatch(method.scheme, events, state.size)
     passages = examined_passages(
         system, method, norm, options.placement, options.singular_tolerance
     )
     problem = Problem(mechanism, options, system, norm, state, intervals, by, held, watch, passages)
     problem.code = code
-    if by == "kernel" and options.backend == "auto" and code_is_compiled():
+    if known is not None:
+        measured = known.meter is not None
+    else:
+        measured = by == "kernel" and options.backend == "auto" and code_is_compiled()
+    if measured:
         problem.meter = Meter(mechanism)
-    problem.last_step = last_step
-    problem.stiff = before is not None and before.steps.ends_stiff
+    if before is not None:
+        problem.stiff = before.end.stiff
+        if known is not None:
+            problem.last_step = _repeated_step(before.end)
     # Sweeps say at the end what they met in their steps.
     if options.t_eval is not None and isinstance(method, PSRM) and method.correction == "split":
         problem.stream = OutputStream(system, method.scheme, options.t_eval, by)
     return problem
+
+
+def _repeated_step(end: EndOfSteps) -> float:
+    """The first step (s) of the segment after one with that ``end``; 0: that of a run's start."""
+    longest = LONGEST_REPEATED * (end.time - end.start)
+    last = end.last_time - end.last_start
+    return min(last, longest) if longest > SHORTEST_REPEATED * last else 0.0
 
 
 def sampler(
@@ -619,7 +661,7 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
             norm,
             memory,
             state,
-            problem.watch,
+            cast(EventWatch | None, problem.watch),
             handler,
             problem.passages,
             sink=problem.stream,

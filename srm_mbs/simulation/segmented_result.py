@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from operator import attrgetter
 from typing import Any, Generic, Self, TypeVar
 
@@ -18,6 +17,7 @@ from srm_mbs.errors import KnownKeys
 from srm_mbs.integration.dense_output import StepData, check_within, checked_output_times
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.singular_passages import Bifurcation, Crossing
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.simulation.energy_balance import EnergyBalance, joined_balance
 from srm_mbs.simulation.result import Settings, SimulationResult, Statistics
 
@@ -56,13 +56,14 @@ class SegmentedResult(SimulationResult):
         self._order: IndexArray | slice = slice(None)
         if t_eval is not None:
             self._read_at(t_eval[t_eval <= self.segments[-1].steps.end])
-        self.t_events = self.q_events = self.v_events = None
+        self._events = None
         if first.t_events is not None:
-            count = range(len(first.t_events))
-            self.t_events, self.q_events, self.v_events = (
-                [np.concatenate([getattr(s, name)[i] for s in self.segments]) for i in count]
-                for name in ("t_events", "q_events", "v_events")
+            of_parts = [part._events for part in self.segments if part._events is not None]
+            times, states = (
+                [np.concatenate(parts) for parts in zip(*(events[k] for events in of_parts))]
+                for k in (0, 1)
             )
+            self._events = times, states
 
     @property
     def segments(self) -> tuple[SimulationResult, ...]:

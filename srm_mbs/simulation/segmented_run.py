@@ -23,18 +23,21 @@ from srm_mbs.integration.contacts import Contact, ContactProbe
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import (
     EventFunction,
+    MechanismFunction,
     Occurrence,
     acting,
     prepare_events,
     same_time,
     stop_message,
 )
+from srm_mbs.integration.kernel.events import contact_probe
 from srm_mbs.integration.kernel.system import Evaluator, SuccessiveWorkspaces
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
 from srm_mbs.simulation.options import RunOptions, positive
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.runner import (
+    Segment,
     check_consistent,
     checked_options,
     finished,
@@ -91,17 +94,6 @@ class Event:
     def __call__(self, t: float, q: FloatArray, v: FloatArray) -> Any:
         """The value of the function."""
         return self.function(t, q, v)
-
-
-class _OfState:
-    """An event function as one of the state; pickled with the segments of a run."""
-
-    def __init__(self, event: Callable[..., Any], nq: int) -> None:
-        self._function = event.function if isinstance(event, Event) else event
-        self._q, self._v = slice(None, nq), slice(nq, None)
-
-    def __call__(self, t: float, state: FloatArray) -> Any:
-        return self._function(t, state[self._q], state[self._v])
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,6 +304,10 @@ def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
     return finished(result, checked)
 
 
+def _function_of_state(event: Callable[..., Any], nq: int) -> MechanismFunction:
+    return MechanismFunction(event.function if isinstance(event, Event) else event, nq)
+
+
 def _run_segments(
     mechanism: Mechanism,
     options: RunOptions,
@@ -320,7 +316,7 @@ def _run_segments(
 ) -> R:
     """The segments between the actions of events, joined."""
     t_end, nq = options.t_end, mechanism.model.nq
-    given = prepare_events(options.events, lambda event: _OfState(event, nq))
+    given = prepare_events(options.events, lambda event: _function_of_state(event, nq))
     events = [_RunEvent(event, place) for place, event in enumerate(given)]
     q0, v0 = options.q0, options.v0
     if options.t0 == 0.0 and not (q0 is None and v0 is None):
@@ -333,6 +329,7 @@ def _run_segments(
         period = positive(options.sample_time, "sample_time", " of seconds")
         here = here._replace(controller=_Sampled(options.controller, period))
     parts: list[R] = []
+    segment: Segment[R] | None = None
     t = options.t0
     span = t_end - t
     status, message = RunStatus.RUNNING, ""  # without a message: that of the last segment
@@ -340,20 +337,21 @@ def _run_segments(
     at_once: list[Occurrence] = []
     try:
         mechanism, q, v = _at_start(events, mechanism, here, span, at_once)
-        if at_once:
-            here = here._replace(q0=q, v0=v)
+        if not at_once:
+            q, v = here.q0, here.v0
     except EventError as error:
         raise_at_first_call(error, options.t0)
         parts.append(unstarted_segment(mechanism, here, error, types.plain))
         status, message = parts[0].status, parts[0].message
     while status is RunStatus.RUNNING:
         try:
-            asked = here._replace(events=[event.in_segment() for event in events])
-            before = parts[-1] if parts else None
-            part = run_segment(mechanism, asked, types.plain, workspaces, before)
+            watched = [event.in_segment() for event in events]
+            asked = here._replace(t0=t, q0=q, v0=v, events=watched)
+            segment = run_segment(mechanism, asked, types.plain, workspaces, segment)
+            part = segment.result
             part.request = asked.repeatable()
             parts.append(part)
-            status, t = part.status, part.steps.end
+            status, t = part.status, segment.end.time
             due = []
             for event, times in zip(events, part.t_events or []):
                 event.count += len(times)
@@ -363,7 +361,7 @@ def _run_segments(
                 break
             known = workspaces.evaluator(part.system)
             mechanism, q, v = _after_actions(
-                events, due, part, known, here.controller, span, at_once
+                events, due, segment, known, here.controller, span, at_once
             )
             last = next((event for event in events if event.left <= 0), None)
             if last is not None:
@@ -385,7 +383,6 @@ def _run_segments(
             status = RunStatus.INTERRUPTED
             message = f"Interrupted at t = {t:.6g} s; everything up to there is kept."
         else:
-            here = here._replace(t0=t, q0=q, v0=v)
             status = RunStatus.RUNNING if t_end - t > NEGLIGIBLE_REST * span else RunStatus.FINISHED
         finally:
             if parts and at_once:
@@ -468,7 +465,7 @@ def _act_at_once(
         x = np.concatenate([q, v])
         if system is None:
             system = make_system(mechanism, controller)
-        probe = ContactProbe(system, units, span, t, x)
+        probe = contact_probe(system, units, span, t, x)
         leaving = [event for event in contacts if event.acts_at_once(probe, slack(event))]
         if not leaving:
             return mechanism, q, v
@@ -497,18 +494,16 @@ def _closed(system: OpenSystem | ClosedSystem | Evaluator, t: float, x: FloatArr
     A projection would then gain nothing, and next to a singular configuration it would move ``x``
     off its branch by rounding over sigma.
     """
-    if not system.has_constraints:
-        return True
-    g, c = system.residuals(x, t)
-    # Of lists: they are short, and NumPy takes five times as long.
-    error, rate, speed = (max(map(abs, part.tolist())) for part in (g, c, x[system.nq :]))
+    error, rate = system.largest_residuals(x, t)
+    # Of a list: it is short, and NumPy takes five times as long.
+    speed = max(map(abs, x[system.nq :].tolist()))
     return bool(error < CLOSED_ROUNDING and rate < CLOSED_ROUNDING * (1.0 + speed))
 
 
 def _after_actions(
     events: list[_RunEvent],
     due: list[_RunEvent],
-    part: SimulationResult,
+    segment: Segment[Any],
     known: OpenSystem | ClosedSystem | Evaluator,
     controller: Callable[..., Any] | None,
     span: float,
@@ -522,11 +517,12 @@ def _after_actions(
     EventError
         If an action fails, or an event chatters.
     """
-    mechanism, t = part.mechanism, part.steps.end
+    part, end = segment.result, segment.end
+    mechanism, t = part.mechanism, end.time
     # What was counted here is not counted again just after; the rest has still to be.
-    near = 2.0 * same_time(*part.steps.times[-2:].tolist())
+    near = 2.0 * same_time(end.last_start, end.last_time)
     nq = mechanism.model.nq
-    before = x = part.last_state
+    before = x = segment.last_state
     try:
         # The dense output is on the closures within the tolerance only.
         if not _closed(known, t, x):

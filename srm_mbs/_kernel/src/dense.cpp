@@ -39,7 +39,7 @@ DenseOutput::DenseOutput(int nq, int nv, const std::vector<SchemeDense>& schemes
     if (schemes.empty()) throw std::invalid_argument("there are no schemes");
     for (const auto& [abscissae, extension] : schemes) {
         if (abscissae.empty()) throw std::invalid_argument("there are no abscissae");
-        if (abscissae.size() != schemes[0].first.size())
+        if (abscissae.size() != schemes[0].abscissae.size())
             throw std::invalid_argument("the schemes have other numbers of stages");
         // Every step has its rates, or as many as the extra stages complete.
         const int count = extension.n_rates, own = count - extension.extra_stages();

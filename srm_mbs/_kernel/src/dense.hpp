@@ -56,8 +56,14 @@ struct StepArrays {
     const double* break_rates = nullptr;  // (breaks, n), tangent rates before them
 };
 
-// Abscissae and extension of a scheme.
-using SchemeDense = std::pair<std::vector<double>, Extension>;
+#define SRM_SCHEME_DENSE(field)            \
+    field(std::vector<double>, abscissae) \
+    field(Extension, extension)
+
+// The dense output of a scheme.
+struct SchemeDense {
+    SRM_FIELDS(SRM_SCHEME_DENSE)
+};
 
 class DenseOutput {
 public:

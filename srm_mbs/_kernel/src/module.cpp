@@ -1,6 +1,8 @@
 // The Python module: structs that Python fills, systems, runs, dense output.
 #include <algorithm>
+#include <cmath>
 #include <limits>
+#include <map>
 #include <memory>
 #include <string>
 #include <utility>
@@ -18,6 +20,7 @@
 #include "constants.hpp"
 #include "dense.hpp"
 #include "errors.hpp"
+#include "event_search.hpp"
 #include "interpreter.hpp"
 #include "linear.hpp"
 #include "manifold.hpp"
@@ -38,6 +41,15 @@ const double* vector_of(const Array& array, int size, const char* name) {
         throw nb::value_error((std::string(name) + " has not the shape (" + std::to_string(size) +
                                ",)").c_str());
     return array.data();
+}
+
+// The `size` numbers of `array`.
+std::vector<double> numbers(nb::handle array, int size, const char* name) {
+    std::vector<double> out = to_vector(array);
+    if (static_cast<int>(out.size()) != size)
+        throw nb::value_error((std::string(name) + " has not " + std::to_string(size) +
+                               " numbers").c_str());
+    return out;
 }
 
 std::vector<double> optional_vector(nb::handle object) {
@@ -113,7 +125,9 @@ void bind_structs(nb::module_& m) {
     bind_struct<ClosingLimits>(m, "ClosingLimits");
     bind_struct<ScaledRows>(m, "ScaledRows");
     bind_struct<Extension>(m, "Extension");
+    bind_struct<SchemeDense>(m, "SchemeDense");
     bind_struct<DenseConstants>(m, "DenseConstants");
+    bind_struct<EventConstants>(m, "EventConstants");
     bind_struct<BranchCurve>(m, "BranchCurve");
 }
 
@@ -494,6 +508,58 @@ struct PySystem {
                               owned_array(std::vector<double>(stages.by_laws())));
     }
 
+    // Changes of the velocities by an impulse n (nv,): System::impulse_response().
+    nb::tuple impulse_response(nb::handle q, nb::handle n) {
+        if (!system->constrained()) throw nb::value_error("there are no closures");
+        std::vector<double> along(system->nv), free(system->nv);
+        system->impulse_response(numbers(q, system->nq, "q").data(),
+                                 numbers(n, system->nv, "n").data(), along.data(), free.data());
+        return nb::make_tuple(owned_array(std::move(along)), owned_array(std::move(free)));
+    }
+
+    // The state and, for each row of `changes` (k, w), the state that changed by these shares of its
+    // numbers and of `scale` (2 nv,): (1 + k, nx).
+    nb::object changed_states(nb::handle state, nb::handle scale, const Array& changes) {
+        const std::size_t nx = state_size(), n = 2 * static_cast<std::size_t>(system->nv);
+        const std::vector<double> x = numbers(state, state_size(), "state");
+        const std::vector<double> unit = numbers(scale, static_cast<int>(n), "scale");
+        if (changes.ndim() != 2 || changes.shape(1) < std::max(nx, n))
+            throw nb::value_error("changes has another shape");
+        const std::size_t k = changes.shape(0);
+        std::vector<double> out(x), moved(nx), motion(n);
+        out.resize((1 + k) * nx);
+        for (std::size_t i = 0; i < k; ++i) {
+            const double* shares = changes.data() + i * changes.shape(1);
+            for (std::size_t j = 0; j < nx; ++j) moved[j] = x[j] * (1.0 + shares[j]);
+            for (std::size_t j = 0; j < n; ++j) motion[j] = unit[j] * shares[j];
+            system->retract(moved.data(), motion.data(), &out[(1 + i) * nx]);
+        }
+        return owned_array(std::move(out), {1 + k, nx});
+    }
+
+    // The states (2, nx) after d and 2 d (s) of the motion from `state`; without acceleration where
+    // it cannot be evaluated, or sigma is not above `least_sigma`.
+    nb::object states_ahead(double t, nb::handle state, double d, double least_sigma) {
+        const std::size_t nx = state_size(), nv = system->nv;
+        const std::vector<double> x = numbers(state, state_size(), "state");
+        const double* v = x.data() + system->nq;
+        std::vector<double> rate(2 * nv), motion(2 * nv), out(2 * nx);
+        try {
+            system->evaluate(t, x.data(), System::ZoneView{});
+            if (system->sigma() > least_sigma) system->rate(rate.data());
+        } catch (const EvaluationError&) {
+        }
+        for (std::size_t k = 0; k < 2; ++k, d *= 2.0) {
+            for (std::size_t j = 0; j < nv; ++j) {
+                const double a = rate[nv + j];
+                motion[j] = d * v[j] + 0.5 * d * d * a;
+                motion[nv + j] = d * a;
+            }
+            system->retract(x.data(), motion.data(), &out[k * nx]);
+        }
+        return owned_array(std::move(out), {2, nx});
+    }
+
     void hold(double t, const Array& force, bool keep) {
         system->hold(t, vector_of(force, system->nv, "force"), keep);
     }
@@ -559,10 +625,14 @@ void bind_system(nb::module_& m) {
         .def("linearisation", &PySystem::linearisation, nb::arg("constants"), nb::arg("t"),
              nb::arg("h"), nb::arg("state"), nb::arg("unit"), nb::arg("state_scale"),
              nb::arg("repeats") = 1)
+        .def("impulse_response", &PySystem::impulse_response)
+        .def("changed_states", &PySystem::changed_states)
+        .def("states_ahead", &PySystem::states_ahead)
         .def("hold", &PySystem::hold)
         .def("use_code", &PySystem::use_code, nb::arg("code").none())
         .def("renew", &PySystem::renew, nb::arg("unit"), nb::arg("gap_scale"),
              nb::arg("damping").none(), nb::arg("friction").none())
+        .def("restart", [](PySystem& s) { s.system->restart(); })
         .def_prop_ro("sparse", [](const PySystem& s) { return s.system->sparse(); })
         .def_prop_ro("evaluations", [](const PySystem& s) { return s.system->evaluations; })
         .def_prop_ro("factorisations",
@@ -692,6 +762,170 @@ private:
     }
 };
 
+// Arrays (size,) for functions of the user, which may keep them and write to them: the next row of a
+// block, because an array of its own costs ten times as much.  With the interpreter's lock held.
+class Rows {
+public:
+    // Those of all callers; never deleted, because the interpreter may end first.
+    static Rows& of(int size) {
+        static auto& all = *new std::map<int, Rows>;
+        return all.try_emplace(size, size).first->second;
+    }
+
+    explicit Rows(int size) : size_(static_cast<std::size_t>(size)), taken_(many) {}
+
+    nb::object next(const double* numbers) {
+        if (taken_ == many) {
+            std::vector<double> values(many * size_);
+            double* const first = values.data();
+            nb::object block = owned_array(std::move(values), {many, size_});
+            // Now, because that may collect garbage, whose finalizers may come here.
+            first_ = first;
+            block_ = std::move(block);
+            taken_ = 0;
+        }
+        std::copy_n(numbers, size_, first_ + taken_ * size_);
+        return nb::steal(PySequence_GetItem(block_.ptr(), static_cast<Py_ssize_t>(taken_++)));
+    }
+
+private:
+    static constexpr std::size_t many = 64;
+    std::size_t size_, taken_;
+    double* first_ = nullptr;
+    nb::object block_;
+};
+
+// An EventFunction of a mechanism, which `event` is, and its owner keeps alive.
+class CalledEvent {
+public:
+    CalledEvent(nb::handle event, int nq, int nv)
+        : event_(event), function_(event.attr("function").attr("function")), q_(Rows::of(nq)),
+          v_(Rows::of(nv)), nq_(nq) {}
+
+    // The value at t and a state (nx,); raises what EventFunction raises.
+    double value(double t, const double* state) {
+        const nb::object time = nb::float_(t), q = q_.next(state), v = v_.next(state + nq_);
+        PyObject* const arguments[] = {nullptr, time.ptr(), q.ptr(), v.ptr()};
+        const nb::object found = nb::steal(PyObject_Vectorcall(
+            function_.ptr(), arguments + 1, 3 | PY_VECTORCALL_ARGUMENTS_OFFSET, nullptr));
+        if (!found.is_valid()) {
+            nb::python_error error;
+            if (!error.matches(PyExc_Exception)) throw error;
+            PyException_SetTraceback(error.value().ptr(), error.traceback().ptr());
+            event_.attr("fail")(error.value(), t);
+            throw error;
+        }
+        if (PyFloat_Check(found.ptr())) {
+            const double value = PyFloat_AS_DOUBLE(found.ptr());
+            if (std::isfinite(value)) return value;
+        }
+        return nb::cast<double>(event_.attr("number")(found, t));
+    }
+
+private:
+    nb::handle event_, function_;
+    Rows &q_, &v_;
+    int nq_;
+};
+
+// Values of an event at several times and states (k, nx).
+std::vector<double> event_values(nb::handle event, int nq, const std::vector<double>& times,
+                                 const Array& states) {
+    const std::size_t k = times.size(), nx = states.ndim() == 2 ? states.shape(1) : 0;
+    if (states.ndim() != 2 || states.shape(0) != k || static_cast<int>(nx) < nq)
+        throw nb::value_error("times and states do not fit");
+    CalledEvent called(event, nq, static_cast<int>(nx) - nq);
+    std::vector<double> out(k);
+    for (std::size_t i = 0; i < k; ++i) out[i] = called.value(times[i], states.data() + i * nx);
+    return out;
+}
+
+// Finds the events of a mechanism: EventWatch of events.py.
+struct PyEventWatch final : EventSearch::Functions {
+    nb::object events, read_nodes;  // kept alive
+    std::vector<CalledEvent> called;
+    std::size_t nx;
+    EventSearch search;
+
+    // events: a tuple of EventFunctions.  read_nodes: (dense, times) -> states at the times at which
+    // a step is examined, by the dense output of the reference.
+    PyEventWatch(nb::object events_, nb::object read_nodes_, int nq, int nv, nb::handle fractions,
+                 const EventConstants& constants)
+        : events(std::move(events_)),
+          read_nodes(std::move(read_nodes_)),
+          nx(static_cast<std::size_t>(nq + nv)),
+          search(watched(events), to_vector(fractions), constants, nx) {
+        for (const nb::handle event : events) called.emplace_back(event, nq, nv);
+    }
+
+    static std::vector<WatchedEvent> watched(const nb::object& events) {
+        std::vector<WatchedEvent> out;
+        for (const nb::handle event : events) {
+            const nb::object tolerance = event.attr("start_tolerance");
+            const auto number = [&](const char* name) { return nb::cast<double>(event.attr(name)); };
+            const auto flag = [&](const char* name) { return nb::cast<bool>(event.attr(name)); };
+            out.push_back({number("occurrences"), number("direction"), number("floor"),
+                           tolerance.is_none() ? std::numeric_limits<double>::quiet_NaN()
+                                               : nb::cast<double>(tolerance),
+                           flag("acts"), flag("departs"), !event.attr("rests").is_none()});
+        }
+        return out;
+    }
+
+    double value(std::size_t event, double t, const double* state) override {
+        return called[event].value(t, state);
+    }
+
+    double rounding(std::size_t event, double t, const double* state) override {
+        return nb::cast<double>(
+            events[event].attr("rests")(t, owned_array(std::vector<double>(state, state + nx))));
+    }
+
+    void begin(double t, nb::handle state) {
+        search.begin(t, numbers(state, static_cast<int>(nx), "state").data(), *this);
+    }
+
+    // The step from t to t_new, which ends with `end`.  Its dense output is `compiled`, if there is
+    // one and it can be evaluated, or `reference`.  (time, event, count) of the occurrence that ends
+    // the run, and its state, or None.
+    nb::object after_step(double t, double t_new, nb::handle end, PyStepDense* compiled,
+                          nb::object reference) {
+        const auto states_by = [&](auto&& by_reference) {
+            return [&, by_reference](const double* times, std::size_t k, double* out) {
+                if (compiled) try {
+                    compiled->dense.states(compiled->system, times, static_cast<long>(k), out);
+                    return;
+                } catch (const EvaluationError&) {
+                    // The reference raises the error that says why.
+                }
+                const nb::object at = owned_array(std::vector<double>(times, times + k));
+                const auto found = nb::cast<Array>(by_reference(at));
+                if (found.size() != k * nx) throw nb::value_error("states has another shape");
+                std::copy_n(found.data(), k * nx, out);
+            };
+        };
+        const auto stop = search.after_step(
+            t, t_new, numbers(end, static_cast<int>(nx), "end").data(),
+            states_by([&](const nb::object& at) { return read_nodes(reference, at); }),
+            states_by([&](const nb::object& at) { return reference(at); }), *this);
+        if (!stop) return nb::none();
+        const std::vector<double>& states = search.states[stop->event];
+        return nb::make_tuple(stop->time, stop->event, stop->count,
+                              owned_array(std::vector<double>(states.end() - nx, states.end())));
+    }
+
+    // Times (k,) and states (k, nx) of the occurrences, for each event; those without any are given.
+    nb::tuple found(const nb::object& no_times, const nb::object& no_states) const {
+        nb::list times, states;
+        for (std::size_t i = 0; i < called.size(); ++i) {
+            const std::size_t k = search.times[i].size();
+            times.append(k ? owned_array(search.times[i]) : no_times);
+            states.append(k ? owned_array(search.states[i], {k, nx}) : no_states);
+        }
+        return nb::make_tuple(times, states);
+    }
+};
+
 // The records of a run, and the shapes of their arrays.
 struct PyRecords {
     StepRecords records;
@@ -706,21 +940,23 @@ struct PyRun {
     std::unique_ptr<Run> run;
     const BranchGuard* guard = nullptr;
 
-    // stiff: the scheme where the problem is stiff, if it is another.
+    // stiff: the scheme where the problem is stiff, if it is another.  first_step: of step-size
+    // control (s); 0: what the start allows.
     PyRun(nb::object system_, const ButcherTableau& scheme, const ButcherTableau* stiff,
           const Constants& constants, const ErrorNorm& norm, const IntegratorState& memory,
-          const Array& state, const SmoothIntervals& intervals, const RunOptions& options)
+          const Array& state, const SmoothIntervals& intervals, const RunOptions& options,
+          double t0, double first_step)
         : system(std::move(system_)), s(*nb::cast<PySystem&>(system).system) {
         check_size("ErrorNorm.atol", norm.atol.size());
         check(memory);
         std::vector<double> start = checked_state(state);
         auto control = make_control(scheme, stiff ? *stiff : scheme, constants, norm, memory,
-                                    start, intervals, options);
+                                    start, intervals, options, t0, first_step);
         if (stiff && stiff->stages() != scheme.stages())
             throw nb::value_error("the schemes have other numbers of stages");
         run = std::make_unique<Run>(s, SplitStep(s, scheme, constants, norm), stiff,
                                     std::move(control), memory, std::move(start), intervals,
-                                    options);
+                                    options, t0);
     }
 
     std::unique_ptr<Control> make_control(const ButcherTableau& scheme,
@@ -728,16 +964,17 @@ struct PyRun {
                                           const ErrorNorm& norm, const IntegratorState& memory,
                                           const std::vector<double>& start,
                                           const SmoothIntervals& intervals,
-                                          const RunOptions& options) {
+                                          const RunOptions& options, double t0,
+                                          double first_step) {
         const double t_end = intervals.ends.back();
         std::unique_ptr<Control> control;
         if (options.step > 0.0) {
-            control = std::make_unique<FixedStep>(options.t0, t_end, options.step);
+            control = std::make_unique<FixedStep>(t0, t_end, options.step);
         } else {
-            double first = options.first_step;
+            double first = first_step;
             if (!(first > 0.0))
-                first = initial_step(s, norm, options.t0, start.data(), memory.rate.data(),
-                                     memory.state_scale.data(), t_end - options.t0,
+                first = initial_step(s, norm, t0, start.data(), memory.rate.data(),
+                                     memory.state_scale.data(), t_end - t0,
                                      scheme.controller_order, constants);
             control = std::make_unique<PIControl>(t_end, first, scheme.controller_order,
                                                   stiff.controller_order, constants);
@@ -961,13 +1198,26 @@ void bind_run(nb::module_& m) {
 
     nb::class_<PyStepDense>(m, "StepDense").def("__call__", &PyStepDense::at);
 
+    m.def("event_values", &event_values);
+    nb::class_<PyEventWatch>(
+        m, "EventWatch",
+        nb::type_slots(
+            collected<PyEventWatch, &PyEventWatch::events, &PyEventWatch::read_nodes>()))
+        .def(nb::init<nb::object, nb::object, int, int, nb::handle, const EventConstants&>(),
+             nb::arg("events"), nb::arg("read_nodes"), nb::arg("nq"), nb::arg("nv"),
+             nb::arg("fractions"), nb::arg("constants"))
+        .def("begin", &PyEventWatch::begin)
+        .def("after_step", &PyEventWatch::after_step, nb::arg("t"), nb::arg("t_new"),
+             nb::arg("end"), nb::arg("compiled").none(), nb::arg("reference"))
+        .def("found", &PyEventWatch::found);
+
     nb::class_<PyRun>(m, "Run", nb::type_slots(collected<PyRun, &PyRun::system>()))
         .def(nb::init<nb::object, const ButcherTableau&, const ButcherTableau*, const Constants&,
                       const ErrorNorm&, const IntegratorState&, const Array&,
-                      const SmoothIntervals&, const RunOptions&>(),
+                      const SmoothIntervals&, const RunOptions&, double, double>(),
              nb::arg("system"), nb::arg("scheme"), nb::arg("stiff").none(), nb::arg("constants"),
              nb::arg("norm"), nb::arg("memory"), nb::arg("state"), nb::arg("intervals"),
-             nb::arg("options"), nb::keep_alive<1, 3>(), nb::keep_alive<1, 4>(),
+             nb::arg("options"), nb::arg("t0"), nb::arg("first_step"), nb::keep_alive<1, 3>(), nb::keep_alive<1, 4>(),
              nb::keep_alive<1, 5>(), nb::keep_alive<1, 6>(), nb::keep_alive<1, 10>())
         .def("advance", &PyRun::advance, nb::arg("steps"), nb::arg("seconds"))
         .def("attempt_from", &PyRun::attempt_from)
@@ -1078,7 +1328,7 @@ struct PyDense {
             const DenseConstants& constants, const PySteps& steps_)
         : steps(steps_),
           dense(nq, nv, schemes, constants,
-                steps.arrays(nq, nv, schemes.empty() ? 0 : schemes[0].first.size())),
+                steps.arrays(nq, nv, schemes.empty() ? 0 : schemes[0].abscissae.size())),
           nx(static_cast<std::size_t>(nq + nv)) {}
 
     nb::object states(PySystem& owner, const Array& t) {

@@ -53,7 +53,7 @@ void StepRecords::clear() {
 
 Run::Run(System& system, SplitStep step_, const ButcherTableau* stiff,
          std::unique_ptr<Control> control_, IntegratorState memory_, std::vector<double> state_,
-         SmoothIntervals intervals, const RunOptions& options)
+         SmoothIntervals intervals, const RunOptions& options, double t0)
     : system(system),
       step(std::move(step_)),
       control(std::move(control_)),
@@ -64,10 +64,10 @@ Run::Run(System& system, SplitStep step_, const ButcherTableau* stiff,
       intervals_(std::move(intervals)),
       eps_factor_(options.eps_factor),
       eps_power_(options.eps_power),
-      t0_(options.t0),
+      t0_(t0),
       max_step_(options.max_step),
-      t_(options.t0),
-      smallest_(constants().smallest_step * std::abs(t_end() - options.t0)),
+      t_(t0),
+      smallest_(constants().smallest_step * std::abs(t_end() - t0)),
       open_residual_(constants().open_residual),
       search_below_(constants().search_below),
       examines_(options.examines),

@@ -40,9 +40,7 @@ struct SmoothIntervals {
 };
 
 #define SRM_RUN_OPTIONS(field)                                                         \
-    field(double, t0)                                                                  \
     field(double, step)            /* fixed step (s); 0: step-size control */          \
-    field(double, first_step)      /* of step-size control (s); 0: what the start allows */ \
     field(double, max_step)                                                            \
     field(std::string, placement)  /* "automatic" or "off" */                          \
     field(bool, arrivals)          /* stop before an end next to a singular configuration */ \
@@ -115,7 +113,7 @@ public:
     // and `options` are not copied: their owner outlives the run.
     Run(System& system, SplitStep step, const ButcherTableau* stiff,
         std::unique_ptr<Control> control, IntegratorState memory, std::vector<double> state,
-        SmoothIntervals intervals, const RunOptions& options);
+        SmoothIntervals intervals, const RunOptions& options, double t0);
 
     // Makes up to `steps` accepted steps, or as many as take `seconds`.
     Stop advance(long steps, double seconds);

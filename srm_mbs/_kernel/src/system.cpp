@@ -479,6 +479,10 @@ void System::renew(std::vector<double> unit, std::vector<double> residual_scale,
     data_.damping = std::move(damping);
     data_.friction = std::move(friction);
     find_friction();
+    restart();
+}
+
+void System::restart() {
     track_laws(false);
     held_from_.clear();
     held_.clear();
@@ -1094,6 +1098,22 @@ void System::correction(double* out) {
 void System::free_acceleration(double* out) {
     std::copy(projection_->white_force.begin(), projection_->white_force.end(), out);
     projection_->unwhiten(out);
+}
+
+void System::impulse_response(const double* q, const double* n, double* along, double* free) {
+    auto& w = *work_;
+    std::copy(q, q + nq, w.q.data());
+    w.v.setZero();
+    pinocchio_model::compute_terms(w);
+    update_closures(q, false);
+    update_drives(0.0, false);
+    std::fill(bias_.begin(), bias_.end(), 0.0);
+    Projection& p = *projection_;
+    p.factor(w.data.M.data(), n, bias_.data(), -1.0);
+    free_acceleration(along);
+    std::copy(p.white_force.begin(), p.white_force.end(), free);
+    p.remove_normal(free);
+    p.unwhiten(free);
 }
 
 void System::normal_part(const double* w, double* out) const {

@@ -175,6 +175,8 @@ public:
     // Resets the system for a run from another start, on which these values depend.
     void renew(std::vector<double> unit, std::vector<double> residual_scale,
                std::vector<double> damping, std::vector<double> friction);
+    // Resets the system for another run from a start that these do not depend on.
+    void restart();
     // Whether `force` (nv,) is the force held last.
     bool holds(const double* force) const;
 
@@ -194,6 +196,9 @@ public:
     void multiplier_of(const double* a, double* out);         // E (G a + Gdot v - s'') (nv,)
     // E g (nv,), without `allowed` of the rows of the drives, and g - s of these.
     void closing(const std::vector<double>& allowed, double* out);
+    // With the terms of the stage lost: changes (nv,) of the velocities at q by an impulse n (nv,),
+    // M^-1 n without the closures and (1 - P) M^-1 n with their impulses.
+    void impulse_response(const double* q, const double* n, double* along, double* free);
     void driven_residuals(std::vector<double>& out) const;
     // M-orthonormal velocities (k, nv) that satisfy the closures, whatever the drives; their number.
     // `rates` (k, drives), if asked for: those of the drives along them.

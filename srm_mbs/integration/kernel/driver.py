@@ -16,8 +16,9 @@ from srm_mbs.integration import driver
 from srm_mbs.integration.breakpoints import BreakpointHandler
 from srm_mbs.integration.critical_passages import CriticalPassages, ExaminedPassage
 from srm_mbs.integration.dense_output import StepData
-from srm_mbs.integration.driver import RunRecord, StepSink, Tick
+from srm_mbs.integration.driver import EndOfSteps, RunRecord, StepSink, Tick
 from srm_mbs.integration.events import EventWatch
+from srm_mbs.integration.kernel.events import CompiledEventWatch
 from srm_mbs.integration.kernel.marshalling import DECISIONS, steps_from
 from srm_mbs.integration.kernel.run import CompiledRun, ReturnReason
 from srm_mbs.integration.messages import RunFailure, StopReason
@@ -75,6 +76,16 @@ class CompiledRecord(RunRecord):
         self._suspects, self._records = self.run.core.suspect_times(), self._take_records()
         self.run = None
 
+    def end_of_steps(self) -> EndOfSteps:
+        """The end of the steps, before :meth:`close`."""
+        core = self.run.core
+        if not core.count:
+            return EndOfSteps(self.t0, self.t0, self.t0, self.t0, None, False)
+        last, t = core.last(), core.t
+        state = self.stop_state if core.count == 1 else None
+        time = t if self.stop is None else self.stop
+        return EndOfSteps(self.t0, last.t, t, time, state, last.stiff)
+
     def _take_records(self) -> Any:
         start = (self.t0, self.x0) if self.rest is None else self.rest
         return self.run.core.take_records(*start)
@@ -106,7 +117,7 @@ def integrate(
     run: CompiledRun,
     *,
     tick: Tick | None = None,
-    events: EventWatch | None = None,
+    events: EventWatch | CompiledEventWatch | None = None,
     passing: BreakpointHandler | None = None,
     passages: CriticalPassages | None = None,
     sink: StepSink | None = None,

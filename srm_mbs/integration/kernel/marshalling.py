@@ -24,6 +24,7 @@ from srm_mbs.integration import (
     critical_passages,
     dense_output,
     driver,
+    events,
     reversals,
     singular_endpoints,
 )
@@ -326,9 +327,7 @@ def collocation_struct(count: int) -> Any:
 @lru_cache(maxsize=64)
 def options_struct(
     *,
-    t0: float,
     step: float | None,
-    first_step: float | None,
     max_step: float,
     placed: str,
     arrivals: bool,
@@ -338,9 +337,7 @@ def options_struct(
 ) -> Any:
     """``RunOptions`` of run.hpp."""
     return _core.RunOptions(
-        t0=t0,
         step=0.0 if step is None else step,
-        first_step=0.0 if first_step is None else float(first_step),
         max_step=max_step,
         placement=placed,
         arrivals=arrivals,
@@ -377,26 +374,32 @@ def dense_constants() -> Any:
     )
 
 
-SchemeDense = tuple[list[float], Any]
-"""Abscissae and ``Extension`` of a scheme: ``SchemeDense`` of dense.hpp."""
-
-
-def scheme_dense(scheme: ButcherTableau) -> SchemeDense:
-    """Abscissae and extension of ``scheme``."""
-    return scheme.abscissae.tolist(), extension_struct(scheme.dense)
+@lru_cache(maxsize=64)
+def scheme_dense(scheme: ButcherTableau) -> Any:
+    """``SchemeDense`` of dense.hpp."""
+    return _core.SchemeDense(abscissae=scheme.abscissae, extension=extension_struct(scheme.dense))
 
 
 @lru_cache(maxsize=64)
-def dense_structs(scheme: ButcherTableau) -> tuple[SchemeDense, Any]:
-    """``SchemeDense`` and ``DenseConstants`` for the dense output of one step."""
-    return scheme_dense(scheme), dense_constants()
-
-
-@lru_cache(maxsize=64)
-def scheme_denses(scheme: ButcherTableau) -> list[SchemeDense]:
+def scheme_denses(scheme: ButcherTableau) -> list[Any]:
     """The dense outputs of a run: of ``scheme`` and, where it has one, of its scheme for stiff
     problems."""
     return [scheme_dense(one) for one in (scheme, scheme.stiff) if one is not None]
+
+
+@lru_cache(maxsize=1)
+def event_constants() -> Any:
+    """``EventConstants`` of event_search.hpp."""
+    return _core.EventConstants(
+        same_time_step=events.SAME_TIME_STEP,
+        same_time_rounding=events.SAME_TIME_ROUNDING,
+        max_halvings=events.MAX_HALVINGS,
+        max_bisections=events.MAX_BISECTIONS,
+        max_root_steps=events.MAX_ROOT_STEPS,
+        converged_step=events.CONVERGED_STEP,
+        fast_convergence=events.FAST_CONVERGENCE,
+        vertex_value=events.VERTEX_VALUE,
+    )
 
 
 _STEP_ARRAYS = ("times", "states", "rates", "corrections", "sigmas", "end_rate", "stiff")

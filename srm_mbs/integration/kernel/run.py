@@ -13,7 +13,7 @@ from srm_mbs.dynamics.system import System, Zone
 from srm_mbs.integration import driver, singular_endpoints
 from srm_mbs.integration.breakpoints import BreakpointHandler, SmoothIntervals
 from srm_mbs.integration.control.step_size import StepDecision
-from srm_mbs.integration.events import StepDense, step_dense
+from srm_mbs.integration.events import step_dense
 from srm_mbs.integration.kernel import marshalling
 from srm_mbs.integration.kernel.marshalling import CONSTANTS, DECISIONS
 from srm_mbs.integration.kernel.system import Evaluator
@@ -89,6 +89,38 @@ def first_stage(
     return marshalling.state_struct(memory)
 
 
+class CompiledStepDense:
+    """Dense output of the step that ``run`` made last, from the state ``start`` (nx,).
+
+    Attributes
+    ----------
+    compiled
+        That of the kernel; None where the step used a zone, or went along a curve.
+    """
+
+    __slots__ = ("_run", "_start", "_system", "compiled")
+
+    def __init__(self, run: CompiledRun, system: System, start: FloatArray) -> None:
+        self._run, self._system, self._start = run, system, start
+        last = run.core.last()
+        self.compiled: Any = None
+        if not (last.in_zone or last.critical):
+            own = marshalling.scheme_dense(run.method.scheme.member(last.stiff))
+            self.compiled = run.core.step_dense(start, own, marshalling.dense_constants())
+
+    def by_reference(self, times: FloatArray) -> FloatArray:
+        """States (k, nx) at ``times`` (k,) s, by the reference."""
+        run = self._run
+        dense = step_dense(self._system, run.method.scheme, self._start, run.last(), run.core.t)
+        return dense(times)
+
+    def __call__(self, times: FloatArray) -> FloatArray:
+        if self.compiled is not None:
+            with suppress(ArithmeticError):  # the reference raises the error that says why
+                return self.compiled(times)  # type: ignore[no-any-return]
+        return self.by_reference(times)
+
+
 class CompiledRun:
     """A run of the kernel that can be advanced step by step.
 
@@ -150,9 +182,7 @@ class CompiledRun:
         self.adaptive = step is None
         stiff = method.scheme.stiff
         options = marshalling.options_struct(
-            t0=t0,
             step=step,
-            first_step=first_step,
             max_step=max_step,
             placed=placed,
             arrivals=arrivals,
@@ -170,6 +200,8 @@ class CompiledRun:
             state,
             marshalling.intervals_struct(intervals),
             options,
+            t0,
+            0.0 if first_step is None else float(first_step),
         )
 
     def advance(self, steps: int = 0) -> ReturnReason:
@@ -214,26 +246,9 @@ class CompiledRun:
             placement="critical" if r.critical else "",
         )
 
-    def step_dense(self, system: System, start: FloatArray) -> StepDense:
+    def step_dense(self, system: System, start: FloatArray) -> CompiledStepDense:
         """Dense output of the step made last, from the state ``start``."""
-        scheme, t = self.method.scheme, self.core.t
-
-        def by_reference() -> StepDense:
-            return step_dense(system, scheme, start, self.last(), t)
-
-        last = self.core.last()
-        if last.in_zone or last.critical:
-            return by_reference()
-        own = scheme.member(last.stiff)
-        compiled = self.core.step_dense(start, *marshalling.dense_structs(own))
-
-        def states(times: FloatArray) -> FloatArray:
-            try:
-                return compiled(times)  # type: ignore[no-any-return]
-            except ArithmeticError:  # the reference raises the error that says why
-                return by_reference()(times)
-
-        return states
+        return CompiledStepDense(self, system, start)
 
     def memory(self) -> IntegratorState:
         """The state of the integrator before the next step."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, Self
+from contextlib import suppress
+from functools import lru_cache
+from typing import Any, Self, cast
 
 import numpy as np
 
@@ -117,7 +119,7 @@ class SuccessiveWorkspaces:
     def of(self, system: ClosedSystem | OpenSystem, code: Any) -> Any:
         """That of ``system``, as new; ``code`` as for :func:`make_kernel_system`."""
         if system is self._system:
-            self._kernel_system.renew(**system.constants_of_start())
+            self._kernel_system.restart()
         else:
             self._system = None
             self.__exit__(None)
@@ -141,6 +143,11 @@ def _idle_or_new(pool: deque[Any] | None, system: ClosedSystem | OpenSystem, cod
     kernel_system.renew(**system.constants_of_start())
     kernel_system.use_code(code)
     return kernel_system
+
+
+@lru_cache(maxsize=64)
+def _ones(size: int) -> FloatArray:
+    return np.ones(size)
 
 
 class _KernelTerms:
@@ -187,13 +194,21 @@ class Evaluator:
         self.system.begin_step(t, state)
         self.kernel_system.begin_step(t, state)
 
-    def residuals(self, state: FloatArray, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
-        """As :meth:`~srm_mbs.dynamics.multibody.ClosedSystem.residuals`."""
+    def largest_residuals(self, state: FloatArray, t: float) -> tuple[float, float]:
+        """As :meth:`~srm_mbs.dynamics.multibody.ClosedSystem.largest_residuals`."""
+        system = self.system
+        if system.has_constraints:
+            with suppress(ArithmeticError):  # the reference raises the error that says why
+                unit = _ones(len(cast(ClosedSystem, system).residual_scale))
+                return self.kernel_system.largest_errors(t, *system.split(state), unit)  # type: ignore[no-any-return]
+        return system.largest_residuals(state, t)
+
+    def impulse_response(self, q: FloatArray, n: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As :meth:`~srm_mbs.dynamics.multibody.ClosedSystem.impulse_response`."""
         try:
-            g, c = self.kernel_system.closure_errors(np.array([t]), state[None])
+            return self.kernel_system.impulse_response(q, n)  # type: ignore[no-any-return]
         except ArithmeticError:
-            return self.system.residuals(state, t)  # raises the error that says why
-        return g[0], c[0]
+            return self.system.impulse_response(q, n)  # raises the error that says why
 
     def branch_nodes(self, norm: ErrorNorm) -> CompiledNodes:
         """Makes the nodes of the motion next to a singular configuration."""

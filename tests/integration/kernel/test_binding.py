@@ -90,11 +90,8 @@ def test_a_state_of_another_size_is_refused() -> None:
 
 def test_steps_of_another_shape_are_refused() -> None:
     solution = srm.simulate(load("four_bar"), 1.0, backend="kernel")
-    steps, extension = solution.steps, solution.scheme.dense
+    steps, schemes = solution.steps, marshalling.scheme_denses(solution.scheme)
     given = fields(marshalling.steps_struct(steps))
-    schemes = [
-        (np.append(solution.scheme.c, 1.0).tolist(), marshalling.extension_struct(extension))
-    ]
     for name in ("states", "rates", "sigmas", "corrections", "end_rate"):
         array = getattr(steps, name)
         wrong = core.StepArrays(**given | {name: np.ascontiguousarray(array[..., 1:])})

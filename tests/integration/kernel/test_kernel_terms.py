@@ -94,9 +94,11 @@ def test_terms_are_those_of_the_reference_for_any_kind_of_joint(name: str) -> No
         size = np.abs(terms.rate()).max()
         assert np.abs(found["rate"] - terms.rate()).max() < 1e-13 * size / terms.sigma
         assert found["sigma"] == pytest.approx(terms.sigma, rel=1e-12)
-        residuals = Evaluator(system, kernel_system).residuals(state)
+        residuals = kernel_system.closure_errors(np.zeros(1), state[None])
         for found_ones, own in zip(residuals, system.residuals(state)):
             assert np.abs(found_ones - own).max() < 1e-14 * (1.0 + np.abs(state).max())
+        largest = Evaluator(system, kernel_system).largest_residuals(state, 0.0)
+        assert largest == pytest.approx(system.largest_residuals(state, 0.0), abs=1e-13)
 
 
 def _resident() -> float:

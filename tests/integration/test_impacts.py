@@ -11,6 +11,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.observables import Observables
+from tests.support.backends import on_both
 from tests.support.bundled import load
 
 
@@ -33,8 +34,12 @@ def after_impact(
 
 
 @pytest.mark.parametrize("name", ["five_bar", "delta_robot", "spatial_four_bar", "pendulum_chain"])
-def test_an_impact_is_that_of_the_equations_of_impulses(name: str) -> None:
+@on_both
+def test_an_impact_is_that_of_the_equations_of_impulses(
+    name: str, backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """At several states one after the other, which share what the mechanism keeps."""
+    monkeypatch.setenv("SRM_MBS_BACKEND", backend)
     mechanism = load(name)
     run = srm.simulate(mechanism, 0.3)
     random = np.random.default_rng(1)

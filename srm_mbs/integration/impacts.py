@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Any
 
+from srm_mbs._kernel import core
 from srm_mbs._kernel.workspace import LARGE
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.integration.kernel.backend import backend
+from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
 from srm_mbs.model.mechanism import per_model
 from srm_mbs.model.numbers import finite_array
 from srm_mbs.model.validation import checked_start
@@ -20,10 +24,26 @@ not let the mechanism move along n."""
 
 
 @per_model
-def _idle_systems(mechanism: Mechanism) -> deque[OpenSystem | ClosedSystem]:
+def _idle_systems(mechanism: Mechanism) -> deque[OpenSystem | ClosedSystem | Evaluator]:
     """The equations of motion that an impact left: their parts that depend on the start do not
     matter to impulses."""
     return deque(maxlen=1)
+
+
+def _share(restitution: Any) -> float | None:
+    """``restitution`` as a number from 0 to 1; None if it is none."""
+    if type(restitution) is not float:
+        found = finite_array(restitution, ())
+        restitution = math.nan if found is None else float(found)
+    return restitution if 0.0 <= restitution <= 1.0 else None
+
+
+def _make_system(mechanism: Mechanism) -> OpenSystem | ClosedSystem | Evaluator:
+    """The equations of motion, on the kernel if it has closures and is available."""
+    system = make_system(mechanism)
+    if core is None or not system.has_constraints:
+        return system
+    return Evaluator(system, make_kernel_system(system))
 
 
 def impact(
@@ -58,8 +78,8 @@ def impact(
         If the mass matrix is not positive definite, or a closure has no direction at q.
     """
     check_mechanism(mechanism)
-    share = finite_array(restitution, ())
-    if share is None or not 0.0 <= share <= 1.0:
+    share = _share(restitution)
+    if share is None:
         raise InputError(
             f"restitution = {safe_repr(restitution)} is not between 0 and 1",
             element="restitution",
@@ -82,16 +102,19 @@ def impact(
     try:
         system = idle.pop()  # two threads never get the same
     except IndexError:
-        system = make_system(mechanism)
-    along, free = system.impulse_response(q, n)
+        system = _make_system(mechanism)
+    used = system
+    if isinstance(system, Evaluator) and backend() == "python":
+        used = system.system
+    along, free = used.impulse_response(q, n)
     if mechanism.model.nv <= LARGE:
         idle.append(system)
-    gain = float(n @ free)
-    if not gain > SMALLEST_GAIN * float(n @ along):
+    gain = float(n.dot(free))
+    if not gain > SMALLEST_GAIN * float(n.dot(along)):
         raise InputError(
             "the closures do not let the mechanism move along this normal",
             element="normal",
             remedy="Give the gradient of the gap, which some motion of the mechanism changes",
         )
-    out: FloatArray = v - (1.0 + float(share)) * float(n @ v) / gain * free
+    out: FloatArray = v - (1.0 + share) * float(n.dot(v)) / gain * free
     return out

@@ -207,7 +207,7 @@ class Observables:
         nq, h = self.mechanism.model.nq, np.diff(times)[chosen]
         motions = h[:, None, None] * (A @ rates[chosen, : A.shape[1]])
         starts = np.repeat(states[chosen], len(c), axis=0)
-        stages = self.moved(starts, motions.reshape(len(starts), -1))
+        stages = self.moved(starts, motions.reshape(len(starts), rates.shape[2]))
         t = times[chosen, None] + np.outer(h, c)
         powers = self.powers(t.ravel(), stages[:, :nq], stages[:, nq:])
         return {name: power.reshape(t.shape) for name, power in powers.items()}

@@ -143,6 +143,8 @@ def test_powers_at_stages_are_those_of_the_states_there() -> None:
     )
     assert found.shape == (2, 2)
     same(found, expected)
+    for own in (compiled, reference):  # of a run without steps
+        assert own.stage_powers(chosen[:0], *steps, rates, A, c)["strut"].shape == (0, 2)
     h = steps[0][5] - steps[0][4]
     moved = 0.3 * rates[4, 0] + 0.5 * rates[4, 1]
     place = pin.integrate(mechanism.model, q[4], h * moved[: mechanism.model.nv])

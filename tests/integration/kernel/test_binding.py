@@ -108,7 +108,7 @@ def test_steps_of_another_shape_are_refused() -> None:
 @pytest.mark.parametrize("normals", [None, np.arange(6.0).reshape(3, 2)])
 def test_an_integrator_state_comes_back_as_it_was(normals: np.ndarray | None) -> None:
     values = np.arange(12.0).reshape(4, 3)
-    away = None if normals is None else np.arange(3.0)
+    away = None if normals is None else np.arange(6.0).reshape(2, 3)
     history = MultiplierHistory(np.arange(4.0), values, 2.5, 1e-3, normals, away)
     given = IntegratorState(np.arange(6.0), 0.5, np.ones(6), history, 0.25, 7, True, True, 3, 2)
     given.laws = np.arange(2.0)

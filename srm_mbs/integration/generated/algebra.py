@@ -75,6 +75,7 @@ def algebra_of(
     entry = "U[{}][{}]" if unrolled else "AT(U[{}], {})"
     values = {
         "LOOPS": _UNROLLED_LOOPS if unrolled else _LOOPS,
+        "TIMES_Q": _UNROLLED_TIMES_Q if unrolled else _TIMES_Q,
         "N": nv,
         "ROWS": rows,
         "RANK": rank,
@@ -301,6 +302,44 @@ _UNROLLED_LOOPS = """\
 #define LATER(i, k) UNROLL(i, k + 1, N) if (reach[k] >> i & 1)
 #define PIVOT_ROW(w, k) (k)"""
 
+_UNROLLED_TIMES_Q = """\
+/* x = Q x: reflection k leaves the numbers before the k-th, and its own entry there is 1. */
+static ALWAYS_INLINE void times_q(const Factors *w, double *restrict x) {
+  DOWN(k, RANK) {
+    const double *const v = (const double *)w->V[k];
+    double s = x[k];
+    UNROLL(i, k + 1, N) s += v[i] * x[i];
+    s *= w->tau[k];
+    x[k] -= s;
+    UNROLL(i, k + 1, N) x[i] -= s * v[i];
+  }
+}"""
+
+_TIMES_Q = """\
+/* x = Q x, two reflections at a time, whose products with x do not wait for each other. */
+static ALWAYS_INLINE void times_q(const Factors *w, double *restrict white) {
+  vec *const x = (vec *)white;
+  DOWN(n, RANK / 2) {
+    const int k = (RANK & 1) + 2 * n + 2;
+    const vec *const a = w->V[k - 1], *const c = w->V[k - 2];
+    if (w->count[k - 1] <= SHORT || w->count[k - 2] <= SHORT) {
+      reflect(w, k - 1, white);
+      reflect(w, k - 2, white);
+      continue;
+    }
+    vec first = {0}, second = {0}, both = {0};
+    EACH(b, HIGH) {
+      first += a[b] * x[b];
+      second += c[b] * x[b];
+      both += a[b] * c[b];
+    }
+    const double s = w->tau[k - 1] * total(first);
+    const double t = w->tau[k - 2] * (total(second) - s * total(both));
+    EACH(b, HIGH) x[b] -= s * a[b] + t * c[b];
+  }
+  if (RANK & 1) reflect(w, 0, white);
+}"""
+
 _UNROLLED = """\
   double U[N][N] = {{0}}, L[N][N], force[N];
 @MASS@
@@ -406,28 +445,7 @@ static inline void reflect(const Factors *w, int k, double *restrict x) {
   EACH(b, HIGH) ((vec *)x)[b] -= s * w->V[k][b];
 }
 
-/* x = Q x, two reflections at a time, whose products with x do not wait for each other. */
-static ALWAYS_INLINE void times_q(const Factors *w, int rank, vec *restrict x) {
-  DOWN(n, rank / 2) {
-    const int k = (rank & 1) + 2 * n + 2;
-    const vec *const a = w->V[k - 1], *const c = w->V[k - 2];
-    if (SHORT && (w->count[k - 1] <= SHORT || w->count[k - 2] <= SHORT)) {
-      reflect(w, k - 1, (double *)x);
-      reflect(w, k - 2, (double *)x);
-      continue;
-    }
-    vec first = {0}, second = {0}, both = {0};
-    EACH(b, HIGH) {
-      first += a[b] * x[b];
-      second += c[b] * x[b];
-      both += a[b] * c[b];
-    }
-    const double s = w->tau[k - 1] * total(first);
-    const double t = w->tau[k - 2] * (total(second) - s * total(both));
-    EACH(b, HIGH) x[b] -= s * a[b] + t * c[b];
-  }
-  if (rank & 1) reflect(w, 0, (double *)x);
-}
+@TIMES_Q@
 
 /* x = Q x or, transposed, x = Q^T x, with the first `rank` reflections. */
 void srm_mbs_times_q(const void *work, int rank, int transposed, double *restrict white) {
@@ -437,30 +455,32 @@ void srm_mbs_times_q(const void *work, int rank, int transposed, double *restric
   if (transposed)
     for (int k = 0; k < rank; ++k) reflect(w, k, (double *)x);
   else if (rank == RANK)
-    times_q(w, RANK, x);
+    times_q(w, (double *)x);
   else
-    times_q(w, rank, x);
+    for (int k = rank; k-- > 0;) reflect(w, k, (double *)x);
   memcpy(white, x, N * sizeof *white);
 }
 
-static ALWAYS_INLINE void normal(const Factors *w, int rank, const double *restrict g,
-                                 double *restrict white) {
-  vec left[WIDE] = {{0}}, x[HIGH] = {{0}};
-  memcpy(left, g, ROWS * sizeof *g);
-  UP(k, rank) {
-    const int row = PIVOT_ROW(w, k);
-    const double y = AT(left, w->order[k]) * w->inverse_pivot[k];
-    AT(x, row) = y;
-    EACH(b, WIDE) left[b] -= y * w->X[row][b];
-  }
-  times_q(w, rank, x);
-  memcpy(white, x, N * sizeof *white);
+static ALWAYS_INLINE void solve_pivot(const Factors *w, int k, vec *restrict left,
+                                      double *restrict x) {
+  const int row = PIVOT_ROW(w, k);
+  const double y = x[row] = AT(left, w->order[k]) * w->inverse_pivot[k];
+  EACH(b, WIDE) left[b] -= y * w->X[row][b];
 }
 
 /* white = Q R^-T Pi^T g */
 void srm_mbs_normal(const void *work, int rank, const double *restrict g, double *restrict white) {
-  if (rank == RANK) normal(work, RANK, g, white);
-  else normal(work, rank, g, white);
+  const Factors *const w = work;
+  vec left[WIDE] = {{0}}, x[HIGH] = {{0}};
+  memcpy(left, g, ROWS * sizeof *g);
+  if (rank == RANK) {
+    UP(k, RANK) solve_pivot(w, k, left, (double *)x);
+    times_q(w, (double *)x);
+  } else {
+    for (int k = 0; k < rank; ++k) solve_pivot(w, k, left, (double *)x);
+    for (int k = rank; k-- > 0;) reflect(w, k, (double *)x);
+  }
+  memcpy(white, x, N * sizeof *white);
 }
 
 /* g = Pi R^-1 Q^T white */

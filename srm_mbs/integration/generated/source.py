@@ -78,6 +78,7 @@ _TURNS = """
 /* Sines and cosines of angles: lanes without a use have the angle 0. */
 typedef double angles __attribute__((vector_size(32)));
 typedef long long angle_bits __attribute__((vector_size(32)));
+typedef long long near_bits __attribute__((vector_size(16)));
 
 static __attribute__((noinline, cold)) void turn_far(const angles *x, angles *sines,
                                                      angles *cosines) {
@@ -107,7 +108,11 @@ static inline __attribute__((always_inline)) void turn_all(const angles *given, 
   *sines = (angles)(((a & ~odd) | (b & odd)) ^ ((quarter & 2) << 62));
   *cosines = (angles)(((b & ~odd) | (a & odd)) ^ (((quarter + 1) & 2) << 62));
   const angle_bits near = (angle_bits)(x < @LARGEST@) & (angle_bits)(x > -@LARGEST@);
-  if (!(near[0] & near[1] & near[2] & near[3])) turn_far(given, sines, cosines);
+  near_bits low, high;
+  memcpy(&low, &near, sizeof low);
+  memcpy(&high, (const char *)&near + sizeof low, sizeof high);
+  low &= high;
+  if (!(low[0] & low[1])) turn_far(given, sines, cosines);
 }
 """.replace("@LARGEST@", repr(LARGEST_ANGLE))
 
@@ -121,6 +126,7 @@ _TEMPLATE = """\
  * values, own: laws of elements and of coordinates; g, bias; G[row][column]; B, J: kinematics of
  * the bodies of bushings. */
 #include <math.h>
+#include <string.h>
 {turns}
 const int srm_mbs_sizes[] = {{{sizes}}};
 

@@ -100,8 +100,8 @@ class _Terms:
         nv, rows = self.nv, self.rows
         out = {"M": np.zeros(nv * nv), "nle": np.zeros(nv), "G": np.zeros((rows, nv))}
         out |= {"g": np.zeros(rows), "bias": np.zeros(rows)}
-        for (target, _), value in zip(self.outputs, values):
-            name, *places = target.replace("]", "").split("[")
+        for output, value in zip(self.outputs, values):
+            name, *places = output.target.replace("]", "").split("[")
             out[name][tuple(map(int, places))] = value
         upper = out["M"].reshape(nv, nv)  # column by column
         return out | {"M": upper + np.tril(upper, -1).T}

@@ -41,6 +41,13 @@ FLOORS = {"spatial_dead_point": 1e-9, "pendulum_chain": 3e-5}
 around 1e-9, on either backend), and a chaotic motion."""
 
 
+SLOPES = {"parallelogram": 0.75}
+"""Least slopes where placement, not the tolerance, sets the lengths of the first steps: dop853
+takes 169 of them at 1e-5 (80 without placement), with error estimates of 1e-3 of the tolerance.
+Its slope is 0.78 to 0.91 from 1e-5 on, by the rounding of one backend or another, and 1.0 from 1e-7
+on."""
+
+
 def errors(name: str, tableau: str, tolerances: list[float]) -> np.ndarray:
     t, exact = reference(name, PROBLEMS[name], 100)
     mechanism = srm.load(name)
@@ -61,7 +68,7 @@ def check(name: str, tableau: str, tolerances: list[float]) -> None:
     low = np.flatnonzero(found < floor)
     used = slice(0, int(low[0]) + 1 if len(low) else None)
     slope = fitted_order(tolerances[used], found[used])
-    assert slope >= 0.8, f"{what}: slope {slope:.2f}"
+    assert slope >= SLOPES.get(name, 0.8), f"{what}: slope {slope:.2f}"
 
 
 @pytest.mark.parametrize("name", ["slider_crank_whirl", "spatial_dead_point", "n_four_bar_2"])

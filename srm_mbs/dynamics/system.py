@@ -36,17 +36,20 @@ class Zone:
     normals : (nv, k) or None
         M-orthonormal normals of the closures at the last node, the weakest last.  A motion that
         lingers, with too little momentum to pass, is held tangential to them.
+    predicts
+        False where the multiplier of the dropped rows is zero at all times.
     """
 
     threshold: float
     predict: Callable[[float], FloatArray | None]
     normals: FloatArray | None = None
+    predicts: bool = True
 
     @classmethod
     def without_prediction(cls, threshold: float, nv: int) -> Zone:
         """The zone whose dropped rows have no multiplier."""
         nothing = np.zeros(nv)
-        return cls(threshold, lambda _: nothing)
+        return cls(threshold, lambda _: nothing, predicts=False)
 
 
 class Terms(Protocol):

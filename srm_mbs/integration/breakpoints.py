@@ -160,7 +160,6 @@ def beside_singular(
     state: FloatArray,
     norm: ErrorNorm,
     end: float,
-    evaluator: Any,
     fresh: IntegratorState,
 ) -> IntegratorState:
     """``fresh``, of the first stage of an interval up to ``end``, made accurate next to a singular
@@ -173,7 +172,7 @@ def beside_singular(
         If the motion from there is not determined.
     """
     try:
-        return start(system, method, t, state, norm, end, evaluator, fresh)
+        return start(system, method, t, state, norm, end, fresh)
     except InputError as error:
         raise EvaluationError(f"at the breakpoint {error}") from error
 
@@ -186,7 +185,7 @@ class BreakpointHandler:
     intervals, system, method, norm
         Of the run.
     evaluator
-        Evaluates the first stage of an interval.
+        Evaluates the stages at breakpoints and next to singular ends; ``system`` by default.
 
     Attributes
     ----------
@@ -290,9 +289,7 @@ class BreakpointHandler:
     def _beside_singular(
         self, t: float, state: FloatArray, fresh: IntegratorState
     ) -> IntegratorState:
-        return beside_singular(
-            self._system, self._method, t, state, self._norm, self.end, self._evaluator, fresh
-        )
+        return beside_singular(self._evaluator, self._method, t, state, self._norm, self.end, fresh)
 
     def singular_arrival(
         self, t: float, state: FloatArray, memory: IntegratorState, index: int | None = None
@@ -305,9 +302,7 @@ class BreakpointHandler:
         """
         if index is not None:
             self.follow(index)
-        return singular_arrival(
-            self._system, t, state, memory, self._norm, self.end, self._evaluator
-        )
+        return singular_arrival(self._evaluator, t, state, memory, self._norm, self.end)
 
     def done(self) -> None:
         """The run is over: the system may be evaluated at any time."""

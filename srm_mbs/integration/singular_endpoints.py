@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -237,11 +237,10 @@ class BranchMotion:
         geometry: ClosureGeometry,
         analysis: SingularityAnalysis,
         norm: ErrorNorm,
-        evaluator: Any,
         limit: BranchLimit | None = None,
     ) -> BranchMotion:
-        """The motion of ``system``, whose nodes its ``evaluator`` makes if it can."""
-        make = getattr(evaluator, "branch_nodes", None)
+        """The motion of ``system``, which makes its nodes if it can."""
+        make = getattr(system, "branch_nodes", None)
         reference = ReferenceNodes(system, analysis, geometry, norm)
         maker: NodeMaker = reference if make is None else make(norm)
         curve = None if limit is None else limit.curve()
@@ -382,10 +381,9 @@ def singular_arrival(
     memory: IntegratorState,
     norm: ErrorNorm,
     end: float,
-    evaluator: Any = None,
 ) -> IntegratorState:
     """``memory`` at ``t`` (s), with the multipliers known up to ``end`` (s), the end of the run or
-    of its smooth interval.
+    of its smooth interval; all stages are evaluated by ``system``.
 
     Unchanged where they cannot be found: the steps are then made as everywhere else.
     """
@@ -393,7 +391,7 @@ def singular_arrival(
     if analysis is None or memory.history is None:
         return memory
     geometry = analysis.geometry(analysis.split(state)[0], t)
-    motion = BranchMotion.of(system, geometry, analysis, norm, evaluator)
+    motion = BranchMotion.of(system, geometry, analysis, norm)
     try:
         multiplier = system.evaluate(t, state).multiplier().copy()
         here = Point(state, memory.rate, multiplier, memory.sigma)
@@ -514,7 +512,6 @@ def start(
     state: FloatArray,
     norm: ErrorNorm,
     t_end: float,
-    evaluator: System | None = None,
     memory: IntegratorState | None = None,
 ) -> IntegratorState:
     """The memory of ``method`` at the initial state, also on a singular configuration.
@@ -523,8 +520,6 @@ def start(
     ----------
     t_end
         End of the run (s): nothing is evaluated beyond it.
-    evaluator
-        Evaluates the first stage; ``system`` by default.
     memory
         Of a run that continues here, at a breakpoint, with the first stage evaluated directly;
         changed here.  Such a motion need not depart from the singular configuration.
@@ -539,7 +534,7 @@ def start(
     """
     begins = memory is None
     if memory is None:
-        memory = method.start(system if evaluator is None else evaluator, t, state, norm)
+        memory = method.start(system, t, state, norm)
     analysis = system.singularities
     if analysis is None or not memory.sigma < NEAR_SINGULAR_SIGMA:
         return memory
@@ -553,7 +548,7 @@ def start(
         return memory
     if limit is None:
         return memory
-    motion = BranchMotion.of(system, geometry, analysis, norm, evaluator, limit)
+    motion = BranchMotion.of(system, geometry, analysis, norm, limit)
     unit = geometry.coordinate_unit
     free = free_acceleration(system, t, state)
     multiplier = limit.multiplier(v, free)

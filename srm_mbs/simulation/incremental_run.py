@@ -88,7 +88,7 @@ class IncrementalRun(ABC):
         """
         self._hold(t, force)
         self._evaluator.between(-np.inf, np.inf)
-        memory = start(self.system, self.method, t, state, self.norm, np.inf, self._evaluator)
+        memory = start(self._evaluator, self.method, t, state, self.norm, np.inf)
         order = self.method.scheme.controller_order or 1
         first = initial_step(self._evaluator, state, memory, self.norm, span, order, t)
         self._begin(t, state, memory, first)
@@ -143,7 +143,7 @@ class IncrementalRun(ABC):
             if not self._matters(fresh, end - self.t):
                 return fresh
             return beside_singular(
-                self.system, self.method, self.t, self.state, self.norm, end, self._evaluator, fresh
+                self._evaluator, self.method, self.t, self.state, self.norm, end, fresh
             )
         except EvaluationError as error:
             raise self._stopped("", error) from error

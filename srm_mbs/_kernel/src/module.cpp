@@ -175,6 +175,7 @@ struct PySystem {
         out["multiplier"] = owned_array(std::move(multiplier));
         out["sigma"] = system->sigma();
         out["rank"] = system->rank();
+        out["rank_deficient"] = system->rank_deficient();
         out["constraint_residual"] = system->closure_residual();
         return out;
     }

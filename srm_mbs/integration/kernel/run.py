@@ -83,8 +83,7 @@ def first_stage(
             return found
     except ArithmeticError:
         pass  # the reference raises the error that says why
-    system = evaluator.system
-    memory = singular_endpoints.start(system, method, t, state, norm, t_end, evaluator)
+    memory = singular_endpoints.start(evaluator, method, t, state, norm, t_end)
     memory.stiff = stiff
     return marshalling.state_struct(memory)
 

@@ -151,14 +151,14 @@ def _ones(size: int) -> FloatArray:
 
 
 class _KernelTerms:
-    """Terms of a regular stage, evaluated by the kernel."""
+    """Terms of a stage, evaluated by the kernel; dropped rows have no multiplier."""
 
-    rank_deficient = False
     held = False
 
     def __init__(self, found: dict[str, Any]) -> None:
         self.sigma: float = found["sigma"]
         self.rank: int = found["rank"]
+        self.rank_deficient: bool = found["rank_deficient"]
         self._found = found
 
     def rate(self) -> FloatArray:
@@ -167,9 +167,12 @@ class _KernelTerms:
     def multiplier(self) -> FloatArray:
         return self._found["multiplier"]  # type: ignore[no-any-return]
 
+    def correction(self) -> FloatArray:
+        return self._found["correction"]  # type: ignore[no-any-return]
+
 
 class Evaluator:
-    """A system whose stages outside the zone are evaluated by the kernel.
+    """A system whose stages are evaluated by the kernel, if no multiplier is to be predicted.
 
     Parameters
     ----------
@@ -216,9 +219,10 @@ class Evaluator:
 
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Any:
         """Terms of a stage; see :class:`~srm_mbs.dynamics.system.System`."""
-        if zone is None:
+        if zone is None or not zone.predicts:
+            threshold = -1.0 if zone is None else zone.threshold
             try:
-                return _KernelTerms(self.kernel_system.terms(t, state))
+                return _KernelTerms(self.kernel_system.terms(t, state, threshold))
             except ArithmeticError:
                 pass  # the reference raises the error that says why
         return self.system.evaluate(t, state, zone)

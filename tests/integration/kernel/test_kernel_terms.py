@@ -10,6 +10,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.dynamics.system import Zone
 from srm_mbs.integration.kernel import backend
 from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
 from tests.support.mechanisms import along_x, rod
@@ -99,6 +100,24 @@ def test_terms_are_those_of_the_reference_for_any_kind_of_joint(name: str) -> No
             assert np.abs(found_ones - own).max() < 1e-14 * (1.0 + np.abs(state).max())
         largest = Evaluator(system, kernel_system).largest_residuals(state, 0.0)
         assert largest == pytest.approx(system.largest_residuals(state, 0.0), abs=1e-13)
+
+
+@pytest.mark.parametrize("name", ["bricard", "delta_robot"])
+def test_terms_whose_dropped_rows_have_no_multiplier_are_those_of_the_reference(name: str) -> None:
+    mechanism = srm.load(name)
+    system = make_system(mechanism)
+    rng = np.random.default_rng(3)
+    q = pin.integrate(mechanism.model, mechanism.q0, rng.normal(size=mechanism.model.nv) * 1e-2)
+    state = np.concatenate([q, rng.normal(size=mechanism.model.nv)])  # corrections are not zero
+    zone = Zone.without_prediction(2.0 * system.evaluate(0.0, state).sigma, mechanism.model.nv)
+    terms = system.evaluate(0.0, state, zone)
+    expected = [x.copy() for x in (terms.rate(), terms.multiplier(), terms.correction())]
+    found = Evaluator(system, make_kernel_system(system)).evaluate(0.0, state, zone)
+    assert found.rank == terms.rank > 0
+    assert found.rank_deficient
+    assert terms.rank_deficient
+    for own, other in zip((found.rate(), found.multiplier(), found.correction()), expected):
+        assert np.abs(own - other).max() < 1e-12 * np.abs(other).max()
 
 
 def _resident() -> float:

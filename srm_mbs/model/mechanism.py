@@ -417,10 +417,10 @@ class MechanismData(ResultOwner):
 
     def _at_no_start(self) -> Self:
         """A copy that shares the results for the model and has none for the start."""
-        changed, set_ = object.__new__(type(self)), object.__setattr__
+        changed = object.__new__(type(self))
         for name, value in vars(self).items():
-            set_(changed, name, value)
-        set_(changed, "_start_results", {})
+            object.__setattr__(changed, name, value)
+        object.__setattr__(changed, "_start_results", {})
         return changed
 
     def __getstate__(self) -> dict[str, Any]:

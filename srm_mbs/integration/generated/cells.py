@@ -21,6 +21,7 @@ from srm_mbs.integration.generated.expressions import (
     Guard,
     Output,
     live_nodes,
+    roots_of,
 )
 
 FEWEST_EQUAL = 8
@@ -94,15 +95,10 @@ def split_cells(outputs: Sequence[Output], guards: Sequence[Guard]) -> SplitOutp
     rest = [output for output in outputs if id(output) not in looped]
     others = [guard for guard in guards if id(guard) not in guarded]
     repeated = sum(len(cells) * _operations(cells[0].nodes) for cells in groups)
-    repeated += _operations(live_nodes(_roots(rest, others)))
-    if repeated > MOST_REPEATED * _operations(live_nodes(_roots(outputs, guards))):
+    repeated += _operations(live_nodes(roots_of(rest, others)))
+    if repeated > MOST_REPEATED * _operations(live_nodes(roots_of(outputs, guards))):
         return plain
     return SplitOutputs([_loop(cells) for cells in groups], rest, others)
-
-
-def _roots(outputs: Iterable[Output], guards: Iterable[Guard]) -> list[Expression]:
-    tested = [node for guard in guards for node in (guard.value, guard.bound)]
-    return tested + [output.value for output in outputs]
 
 
 def _operations(nodes: Iterable[Expression]) -> int:
@@ -110,7 +106,7 @@ def _operations(nodes: Iterable[Expression]) -> int:
 
 
 def _cell(outputs: list[Output], guards: list[Guard]) -> _Cell:
-    roots = _roots(outputs, guards)
+    roots = roots_of(outputs, guards)
     nodes = live_nodes(roots)
     numbers = {node.number: i for i, node in enumerate(nodes)}
     graph: list[object] = []

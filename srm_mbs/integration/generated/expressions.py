@@ -227,6 +227,12 @@ class Guard(NamedTuple):
     cell: int = -1
 
 
+def roots_of(outputs: Iterable[Output], guards: Iterable[Guard]) -> list[Expression]:
+    """The expressions of ``guards`` and then of ``outputs``."""
+    tested = [node for guard in guards for node in (guard.value, guard.bound)]
+    return tested + [output.value for output in outputs]
+
+
 def live_nodes(roots: Iterable[Expression], done: set[int] | None = None) -> list[Expression]:
     """The nodes that ``roots`` need, each after its operands, but those ``done``, which grow."""
     done = set() if done is None else done

@@ -17,6 +17,7 @@ from srm_mbs.integration.generated.expressions import (
     Guard,
     Output,
     live_nodes,
+    roots_of,
 )
 
 
@@ -142,8 +143,7 @@ def _write_block(
     outputs: Sequence[Output], guards: Sequence[Guard], names: _Names, constants_in: str
 ) -> Written:
     """``outputs`` without loops; ``names`` has the leaves that C does not read by their texts."""
-    roots = [node for guard in guards for node in (guard.value, guard.bound)]
-    roots += [out.value for out in outputs]
+    roots = roots_of(outputs, guards)
     live = live_nodes(roots)
     read = [o for node in live if node.depends == VARIABLE for o in node.operands] + roots
     # Parameters and what depends on them alone, as far as the terms read it, in their order.

@@ -101,7 +101,8 @@ def largest_errors(
     system: ClosedSystem | OpenSystem | None = None,
 ) -> tuple[float, float]:
     """The largest errors of :func:`closure_errors` at one state, q (nq,) and v (nv,), and their
-    rates, over the units (rows,) of the rows."""
+    rates, over the units (rows,) of the rows; infinite where they cannot be evaluated:
+    :func:`closure_errors` then raises the error that says why."""
     try:
         with _Lent(_idle_all_rows(mechanism), mechanism, system) as kernel_system:
             return kernel_system.largest_errors(t, q, v, unit)  # type: ignore[no-any-return]
@@ -275,6 +276,7 @@ class CompiledObservables(Observables):
         A: FloatArray,
         c: FloatArray,
     ) -> dict[str, FloatArray]:
+        """As the reference."""
         structs = _structs_of_dampers(self.mechanism)
         if structs is None:
             return super().stage_powers(chosen, times, states, rates, A, c)

@@ -226,7 +226,8 @@ struct PySystem {
                               owned_array(std::move(rates), {n, rows}));
     }
 
-    // The largest |g - s| and |G v - s'| at q (nq,) and v (nv,), over the units (rows,) of the rows.
+    // The largest |g - s| and |G v - s'| at q (nq,) and v (nv,), over the units (rows,) of the rows;
+    // NaN if one is.
     nb::tuple largest_errors(double t, const Array& q, const Array& v, const Array& unit) {
         const int rows = system->rows();
         const double* over = vector_of(unit, rows, "unit");
@@ -238,7 +239,7 @@ struct PySystem {
             double out = 0.0;
             for (int i = 0; i < rows; ++i) {
                 const double error = std::abs(errors[i]) / over[i];
-                if (!(error <= out)) out = error;  // NaN, too
+                if (error > out || std::isnan(error)) out = error;  // nothing is larger than NaN
             }
             return out;
         };
@@ -452,7 +453,8 @@ struct PySystem {
                             const Array& states, const Array& rates, const Array& A,
                             const Array& c, const std::vector<ForceElement>& elements) {
         const std::size_t nx = state_size(), n = 2 * static_cast<std::size_t>(system->nv);
-        const std::size_t stages = c.size(), m = elements.size(), ends = count_of(times, states, static_cast<int>(nx));
+        const std::size_t stages = c.size(), m = elements.size();
+        const std::size_t ends = count_of(times, states, static_cast<int>(nx));
         if (rates.ndim() != 3 || rates.shape(0) + 1 != ends || rates.shape(2) != n || !stages ||
             A.size() % stages != 0 || A.size() / stages > rates.shape(1))
             throw nb::value_error("rates or A has another shape");
@@ -1189,7 +1191,7 @@ void bind_run(nb::module_& m) {
                          };
                          double least = std::numeric_limits<double>::infinity();
                          for (double sigma : s.sigmas)
-                             if (!(sigma >= least)) least = sigma;
+                             if (sigma < least) least = sigma;
                          return nb::make_tuple(s.ranks.size(), s.zones.size(), least, any(s.held),
                                                any(s.stiff));
                      })
@@ -1218,8 +1220,9 @@ void bind_run(nb::module_& m) {
                       const SmoothIntervals&, const RunOptions&, double, double>(),
              nb::arg("system"), nb::arg("scheme"), nb::arg("stiff").none(), nb::arg("constants"),
              nb::arg("norm"), nb::arg("memory"), nb::arg("state"), nb::arg("intervals"),
-             nb::arg("options"), nb::arg("t0"), nb::arg("first_step"), nb::keep_alive<1, 3>(), nb::keep_alive<1, 4>(),
-             nb::keep_alive<1, 5>(), nb::keep_alive<1, 6>(), nb::keep_alive<1, 10>())
+             nb::arg("options"), nb::arg("t0"), nb::arg("first_step"), nb::keep_alive<1, 3>(),
+             nb::keep_alive<1, 4>(), nb::keep_alive<1, 5>(), nb::keep_alive<1, 6>(),
+             nb::keep_alive<1, 10>())
         .def("advance", &PyRun::advance, nb::arg("steps"), nb::arg("seconds"))
         .def("attempt_from", &PyRun::attempt_from)
         .def("go_on", &PyRun::go_on, nb::arg("end"), nb::arg("first"), nb::arg("last"),

@@ -373,7 +373,8 @@ void System::fill(const ClosureRows& closure, int row, const Vec& force, const V
 //
 // x is the point of anchor a in the world, p its offset from the point of anchor b in the axes of
 // b, r and bias the first derivative of p and the second without accelerations of the joints.
-// With `rates` (rows,) the bodies move, and G v is written there instead of G v's derivative and G.
+// With `rates` (rows,), G v is written there, from the velocities of the bodies, and neither G nor
+// Gdot v is computed.
 void System::update_positions(const ClosureRows& closure, bool with_bias, double* rates) {
     const Body a(work_->data, closure.joint_a), b(work_->data, closure.joint_b);
     const bool ground = closure.joint_b == 0;

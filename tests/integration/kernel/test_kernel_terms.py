@@ -102,6 +102,20 @@ def test_terms_are_those_of_the_reference_for_any_kind_of_joint(name: str) -> No
         assert largest == pytest.approx(system.largest_residuals(state, 0.0), abs=1e-13)
 
 
+def test_the_largest_error_of_the_rows_is_not_a_number_if_one_of_them_is_none() -> None:
+    mechanism = srm.load("n_four_bar_2")
+    kernel_system = make_kernel_system(make_system(mechanism))
+    v = mechanism.v0.copy()
+    v[0] = np.nan  # of the first loop alone
+    state = np.concatenate([mechanism.q0, v])[None]
+    rates = kernel_system.closure_errors(np.zeros(1), state)[1][0]
+    assert np.isnan(rates[:2]).all()
+    assert np.isfinite(rates[2:]).all()
+    largest = kernel_system.largest_errors(0.0, mechanism.q0, v, np.ones(len(rates)))
+    assert largest[0] < 1e-15
+    assert np.isnan(largest[1])
+
+
 @pytest.mark.parametrize("name", ["bricard", "delta_robot"])
 def test_terms_whose_dropped_rows_have_no_multiplier_are_those_of_the_reference(name: str) -> None:
     mechanism = srm.load(name)

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import TypeVar
 
 import numpy as np
@@ -192,7 +193,8 @@ class ConstraintMonitor:
     def together(self, searches: Sequence[Search[T]]) -> list[T]:
         """Results of ``searches`` that do not depend on each other.
 
-        All of them are made at once, so that each of their steps takes one call for all.
+        All of them are made at once, so that each of their steps takes one call for all; times
+        that several ask for, or one again, are evaluated once.
         """
         found: dict[int, T] = {}
         asked: dict[int, FloatArray] = {}
@@ -206,13 +208,13 @@ class ConstraintMonitor:
 
         for i in range(len(searches)):
             advance(i, None)
+        known: dict[float, float] = {}
         while asked:
-            order, times = list(asked), list(asked.values())
-            values = self.smallest(np.concatenate(times))
-            at = 0
-            for i, own in zip(order, times):
-                advance(i, values[at : at + len(own)])
-                at += len(own)
+            own = {i: times.tolist() for i, times in asked.items()}
+            new = [t for t in dict.fromkeys(chain.from_iterable(own.values())) if t not in known]
+            known.update(zip(new, self.smallest(np.array(new)).tolist()))
+            for i, times in own.items():
+                advance(i, np.array([known[t] for t in times]))
         return [found[i] for i in range(len(searches))]
 
     def minimum(self, t: FloatArray, values: FloatArray) -> float:
@@ -623,7 +625,7 @@ def _rank_loss_cosine(
 
 
 def _step_at(steps: StepData, time: float) -> int:
-    return int(np.clip(np.searchsorted(steps.times, time) - 1, 0, steps.count - 1))
+    return min(max(int(steps.times.searchsorted(time)) - 1, 0), steps.count - 1)
 
 
 def _along_curve(steps: StepData, time: float) -> bool:
@@ -717,14 +719,9 @@ def find_crossings(
     if not len(dips) and not steps.critical_ranges:
         return ()
     monitor = monitor or ConstraintMonitor(analysis, *monitored())
-    examined = np.flatnonzero(np.bincount(window_of, minlength=len(windows)))
-    tops = [
-        begin + int(np.argmax(sigma[begin : end + 1])) for begin, end in windows[examined].tolist()
-    ]
-    scales = dict(zip(examined.tolist(), monitor.smallest(t[tops] if tops else t[:0]).tolist()))
     searches = [
-        _crossings_at(monitor, steps, t, dip, scales[window])
-        for dip, window in zip(dips.tolist(), window_of.tolist())
+        _crossings_at(monitor, steps, t, dip, begin + int(sigma[begin : end + 1].argmax()))
+        for dip, (begin, end) in zip(dips.tolist(), windows[window_of].tolist())
     ]
     found: dict[float, Crossing] = {}
     for crossings in (*monitor.together(searches), _crossings_along_curves(monitor, steps)):
@@ -738,16 +735,20 @@ def _crossings_at(
     steps: StepData,
     t: FloatArray,
     dip: Sequence[int],
-    scale: float,
+    top: int,
 ) -> Search[list[Crossing]]:
-    """The crossings at a minimum of sigma, the second of the samples ``dip``, which are indices
-    into t (k,).
+    """The crossings at a minimum of sigma, the second of the samples ``dip``.
 
-    ``scale``: the largest singular value of the window.
+    ``dip`` and ``top``, where sigma of the window is largest, are indices into t (k,).
     """
     first, k, last = dip
     times = _times_around(t, first, k, last, DIP_WIDTHS[0], 1)
+    if len(times) == 2:  # an interval alone shows no slope from which it could differ
+        times = np.insert(times, 1, times.mean())
     values = yield times
+    if _lowest(times, values, len(times)).min() >= MINIMUM_DEPTH * values.max():
+        return []  # sigma has it alone, as where the order of its pivots changes
+    scale = float((yield t[[top]])[0])  # the largest singular value of the window
     minima = _minima(values, max(scale, float(values.max())))
     if len(minima) == 1:
         near = slice(minima[0][1] - 1, minima[0][1] + 2)

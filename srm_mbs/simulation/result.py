@@ -33,7 +33,7 @@ from srm_mbs.integration.dense_output import (
 )
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import Occurrence
-from srm_mbs.integration.kernel import sigma_dips
+from srm_mbs.integration.kernel import dense_output as kernel_steps
 from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import CompiledObservables
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -527,7 +527,7 @@ class SimulationResult(RunOutcome):
         def monitored() -> tuple[DenseOutput, float]:
             return self._dense, self.settings.singular_tolerance
 
-        dips = sigma_dips.recorded_dips if self._by_kernel else recorded_dips
+        dips = kernel_steps.recorded_dips if self._by_kernel else recorded_dips
         return find_crossings(self._system, self.scheme, self.steps, monitored, dips)
 
     @cached_property

@@ -16,7 +16,7 @@ import srm_mbs as srm
 from srm_mbs.dynamics.constraints import structure
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.integration import singular_passages as crossings_module
-from srm_mbs.integration.kernel import sigma_dips
+from srm_mbs.integration.kernel import dense_output as kernel_steps
 from srm_mbs.integration.singular_passages import ConstraintMonitor
 from tests.support import reduced
 from tests.support.backends import needs_kernel
@@ -124,7 +124,7 @@ def test_the_kernel_finds_the_same_minima_of_sigma(tableau: str) -> None:
         sigmas = np.abs(level + 0.2 * np.tensordot(rng.uniform(0.0, 1.0, 3), waves, axes=1))
         steps = replace(solution.steps, sigmas=sigmas, stop=rng.uniform(*t[-1, [0, -1]]))
         expected = crossings_module.recorded_dips(scheme, steps)
-        by_kernel = sigma_dips.recorded_dips(scheme, steps)
+        by_kernel = kernel_steps.recorded_dips(scheme, steps)
         found.add(expected is None)
         if expected is None or by_kernel is None:
             assert expected is by_kernel

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -195,8 +195,7 @@ class ConstraintMonitor:
     def together(self, searches: Sequence[Search[T]]) -> list[T]:
         """Results of ``searches`` that do not depend on each other.
 
-        All of them are made at once, so that each of their steps takes one call for all; times
-        that several ask for, or one again, are evaluated once.
+        All of them are made at once, so that each of their steps takes one call for all.
         """
         found: dict[int, T] = {}
         asked: dict[int, FloatArray] = {}
@@ -210,13 +209,13 @@ class ConstraintMonitor:
 
         for i in range(len(searches)):
             advance(i, None)
-        known: dict[float, float] = {}
         while asked:
-            own = {i: times.tolist() for i, times in asked.items()}
-            new = [t for t in dict.fromkeys(chain.from_iterable(own.values())) if t not in known]
-            known.update(zip(new, self.smallest(np.array(new)).tolist()))
-            for i, times in own.items():
-                advance(i, np.array([known[t] for t in times]))
+            order, times = list(asked), list(asked.values())
+            values = self.smallest(np.concatenate(times))
+            at = 0
+            for i, own in zip(order, times):
+                advance(i, values[at : at + len(own)])
+                at += len(own)
         return [found[i] for i in range(len(searches))]
 
     def minimum(self, t: FloatArray, values: FloatArray) -> float:
@@ -751,12 +750,12 @@ def _crossings_at(
     ``dip`` and ``top``, where sigma of the window is largest, are indices into t (k,).
     """
     first, k, last = dip
-    times = _times_around(t, first, k, last, DIP_WIDTHS[0], 1)
+    times = t[sorted({first, max(first, k - 1), k, min(k + 1, last), last})]
     if len(times) == 2:  # an interval alone shows no slope from which it could differ
         times = np.insert(times, 1, times.mean())
-    values = yield np.append(times, t[top])
+    values = yield np.concatenate([times, t[[top]]])
     scale, values = float(values[-1]), values[:-1]  # that of the window, about the largest
-    if _lowest(times, values, len(times)).min() >= MINIMUM_DEPTH * values.max():
+    if _lowest_between(times, values) >= MINIMUM_DEPTH * values.max():
         return []  # sigma has it alone, as where the order of its pivots changes
     minima = _minima(values, max(scale, float(values.max())))
     if len(minima) == 1:
@@ -809,7 +808,7 @@ def _crossing_at(
     near = slice(k - 1, k + 2)
     before, after = float(times[first]), float(times[last])
     sides = values[[first, last]]
-    if not _lowest_bracketed(times[near], values[near]) < MINIMUM_DEPTH * sides.min():
+    if not _lowest_between(times[near], values[near]) < MINIMUM_DEPTH * sides.min():
         return None
     time, value = lowest or (yield from _minimum(times[near], values[near]))
     if not value < MINIMUM_DEPTH * sides.min() or _along_curve(steps, time):
@@ -831,11 +830,12 @@ def _crossing_at(
     return crossing_at(monitor, steps, time, VELOCITY_VALUE * scale / slope, kind)
 
 
-def _lowest_bracketed(t: FloatArray, values: FloatArray) -> float:
-    """Lowest value between three samples (3,), the middle one the smallest, with a margin for
-    curvature."""
-    slopes = np.abs(np.diff(values)) / np.diff(t)
-    return float(values[1] - SLOPE_MARGIN * slopes.max() * np.diff(t).max())
+def _lowest_between(t: FloatArray, values: FloatArray) -> float:
+    """Lowest of the ``values`` (k,) between samples at t (k,), with a margin for curvature."""
+    samples = list(pairwise(zip(t.tolist(), values.tolist())))
+    steepest = max(abs(after - before) / (b - a) for (a, before), (b, after) in samples)
+    longest = max(b - a for (a, _), (b, _) in samples)
+    return float(values.min()) - SLOPE_MARGIN * steepest * longest
 
 
 @dataclass(frozen=True)

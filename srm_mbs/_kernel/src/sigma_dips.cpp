@@ -29,6 +29,41 @@ std::vector<double> largest_around(const std::vector<double>& values, int before
     return out;
 }
 
+// Whether no interval between samples can be marked: in each step the lowest sigma, less the change
+// that the steepest slope of the steps around allows in its longest interval, bounds all of them.
+bool stays_away(const DipSearch& search, const double* times, const double* sigmas, long steps,
+                long width) {
+    const std::size_t stages = search.columns.size();
+    std::vector<double> lengths(stages);
+    for (std::size_t j = 0; j < stages; ++j)
+        lengths[j] = search.abscissae[j] - (j ? search.abscissae[j - 1] : 0.0);
+    const double longest = *std::max_element(lengths.begin(), lengths.end());
+    for (double& length : lengths) length = 1.0 / length;
+    std::vector<double> slopes(steps), lowest(steps);
+    double largest = sigmas[0], before = sigmas[0];
+    for (long i = 0; i < steps; ++i) {
+        double low = before, slope = 0.0;
+        for (std::size_t j = 0; j < stages; ++j) {
+            const double value = sigmas[i * width + search.columns[j]];
+            slope = std::max(slope, std::abs(value - before) * lengths[j]);
+            low = std::min(low, value);
+            largest = std::max(largest, value);
+            before = value;
+        }
+        if (!(low >= search.lingering)) return false;
+        lowest[i] = low;
+        slopes[i] = slope / (times[i + 1] - times[i]);
+    }
+    const int reach = (search.around + static_cast<int>(stages) - 1) / static_cast<int>(stages);
+    slopes = largest_around(slopes, reach, reach);
+    for (long i = 0; i < steps; ++i) {
+        const double change = longest * (times[i + 1] - times[i]) * slopes[i];
+        if (!(lowest[i] - 0.5 * search.slope_margin * change >= search.vanishing * largest))
+            return false;
+    }
+    return true;
+}
+
 }  // namespace
 
 void DipSearch::check() const {
@@ -39,8 +74,9 @@ void DipSearch::check() const {
 
 SigmaDips recorded_dips(const DipSearch& search, const double* times, const double* sigmas,
                         long steps, long width, double end) {
-    const std::size_t stages = search.columns.size();
     SigmaDips found;
+    if (stays_away(search, times, sigmas, steps, width)) return found;
+    const std::size_t stages = search.columns.size();
     std::vector<double>& t = found.t;
     std::vector<double> sigma;
     t.reserve(steps * stages + 1);

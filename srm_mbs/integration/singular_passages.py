@@ -835,7 +835,8 @@ def _lowest_between(t: FloatArray, values: FloatArray) -> float:
     samples = list(pairwise(zip(t.tolist(), values.tolist())))
     steepest = max(abs(after - before) / (b - a) for (a, before), (b, after) in samples)
     longest = max(b - a for (a, _), (b, _) in samples)
-    return float(values.min()) - SLOPE_MARGIN * steepest * longest
+    lowest: float = values.min() - SLOPE_MARGIN * steepest * longest
+    return lowest
 
 
 @dataclass(frozen=True)

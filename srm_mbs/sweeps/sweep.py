@@ -224,7 +224,7 @@ STANDARD = _Pace(0.05, 0.0, 4, 16)
 """With executors of the standard library."""
 SCHEDULED = _Pace(1.0, 0.1, 64, 4)
 """With others, whose schedulers and workers, as those of Dask, spend 10 ms of CPU time on a chunk
-beside what it computes: few chunks, at the begin and at the end as well."""
+beside what it computes: few chunks, at the beginning and at the end as well."""
 
 
 class _Waiting:

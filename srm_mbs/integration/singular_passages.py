@@ -171,7 +171,20 @@ class ConstraintMonitor:
 
     def critical(self, t: float) -> CriticalConfiguration | None:
         """The critical configuration next to the motion at t (s); None if there is none."""
-        return critical_configuration(self.geometry, self.rank, self.place(t), CROSSING_SEARCH)
+        return critical_configuration(
+            self.geometry,
+            self.rank,
+            self.place(t),
+            CROSSING_SEARCH,
+            jacobians=self._jacobians_at,
+        )
+
+    def _jacobians_at(self, places: FloatArray) -> FloatArray:
+        """As of the geometry, in one call of the observables."""
+        nq = self.geometry.model.nq
+        t = places[:, nq] if self.geometry.drives else np.zeros(len(places))
+        unscaled = self._dense.observables.jacobians(t, places[:, :nq])
+        return unscaled * (self.geometry.unit / self.geometry.row_unit[:, None])
 
     def counted_singular(self, t: float) -> FloatArray | None:
         """The critical configuration next to the motion at t (s) whose residual counts as zero

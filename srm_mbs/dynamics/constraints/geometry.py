@@ -133,14 +133,14 @@ class ClosureGeometry:
         spreads = _spreads(int(model.nv)) * self.coordinate_unit
         return np.array([pin.integrate(model, self.start, spread) for spread in spreads])
 
-    def _jacobians(self, q: FloatArray) -> FloatArray:
-        """G of :meth:`closure` (n, rows, nv) at n configurations q (n, nq)."""
-        return np.array([self.closure(each)[1] for each in q])
+    def jacobians(self, places: FloatArray) -> FloatArray:
+        """G of :meth:`closure` (k, rows, n) at k places, as it takes them."""
+        return np.array([self.closure(each)[1] for each in places])
 
     @cached_property
     def _squares(self) -> FloatArray:
         """Mean squares (rows,) of the norms of rows over the open configurations."""
-        G = self._jacobians(self._open_configurations)
+        G = self.jacobians(self._open_configurations)
         squares: FloatArray = (G * G).sum(axis=(0, 2)) / len(G)
         return squares
 

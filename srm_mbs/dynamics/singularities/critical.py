@@ -17,7 +17,7 @@ configuration is a place (q, t).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,8 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, column_groups
 from srm_mbs.model.lazy import cached_property
 
+Jacobians = Callable[[FloatArray], FloatArray]
+"""G (k, rows, n) in units at k places."""
 ITERATIONS = 12
 DIFFERENCE = 1e-5
 """Step (units) of the central differences of G^T u."""
@@ -81,7 +83,7 @@ class CriticalConfiguration:
     @cached_property
     def hessian(self) -> FloatArray:
         """H (n, n): second derivative of u . g by the coordinates."""
-        return _hessian(self.geometry, self.weights, self.q)
+        return _hessian(self.geometry, self.weights, self.q, self.geometry.jacobians)
 
     @cached_property
     def weights(self) -> FloatArray:
@@ -123,27 +125,33 @@ def complement(u: FloatArray) -> FloatArray:
 
 
 def _hessian(
-    geometry: ClosureGeometry, weights: FloatArray, q: FloatArray, at_q: FloatArray | None = None
+    geometry: ClosureGeometry,
+    weights: FloatArray,
+    q: FloatArray,
+    jacobians: Jacobians,
+    at_q: FloatArray | None = None,
 ) -> FloatArray:
     """The second derivative (n, n) of ``weights`` . g by central differences, or by forward ones
     from the first derivative ``at_q`` (n,).
 
     Coordinates that no rows have in common change together."""
     groups, related = column_groups(geometry.mechanism)
+    n = len(geometry.unit)
+    moves = np.zeros((len(groups), n))
+    for move, group in zip(moves, groups):
+        move[group] = DIFFERENCE
 
-    def gradient(e: FloatArray) -> FloatArray:
-        out: FloatArray = weights @ geometry.closure(geometry.move(q, e))[1]
+    def gradients(sign: float) -> FloatArray:
+        places = np.array([geometry.move(q, sign * move) for move in moves])
+        out: FloatArray = weights @ jacobians(places)
         return out
 
-    n = len(geometry.unit)
+    if at_q is None:
+        changes = (gradients(1.0) - gradients(-1.0)) / (2.0 * DIFFERENCE)
+    else:
+        changes = (gradients(1.0) - at_q) / DIFFERENCE
     out = np.zeros((n, n))
-    for group in groups:
-        e = np.zeros(n)
-        e[group] = DIFFERENCE
-        if at_q is None:
-            change = (gradient(e) - gradient(-e)) / (2.0 * DIFFERENCE)
-        else:
-            change = (gradient(e) - at_q) / DIFFERENCE
+    for change, group in zip(changes, groups):
         out[:, group] = np.where(related[:, group], change[:, None], 0.0)
     return out
 
@@ -177,6 +185,7 @@ def critical_configuration(
     reach: float,
     known: Iterable[CriticalConfiguration] = (),
     singular_to: float = 0.0,
+    jacobians: Jacobians | None = None,
 ) -> CriticalConfiguration | None:
     """The critical configuration near q, found by Newton's iteration for (q, u).
 
@@ -196,12 +205,15 @@ def critical_configuration(
     singular_to
         Residual (row units) up to which the configuration is singular: it is then known well
         enough where its residual is.
+    jacobians
+        Another function than that of ``geometry`` for G (k, rows, n) at k places.
 
     Returns
     -------
     CriticalConfiguration or None
         None if there is none within reach.
     """
+    jacobians = jacobians or geometry.jacobians
     g, G = geometry.closure(q)
     size = geometry.row_size
     rows = np.linalg.svd(G / size[:, None])[0][:, :structural_rank].T
@@ -227,7 +239,7 @@ def critical_configuration(
         if not error < best and error < ACCEPTED:
             break
         if moved > FROZEN:
-            H = _hessian(geometry, (u @ rows) / size, x, G.T @ u)
+            H = _hessian(geometry, (u @ rows) / size, x, jacobians, G.T @ u)
         if error < best:
             best, found = error, CriticalConfiguration(geometry, x, rows, u, delta, H)
             decided = error <= DECIDED and abs(found.residual) <= singular_to

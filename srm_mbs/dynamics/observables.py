@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -63,6 +63,22 @@ def conservative_elements(mechanism: MechanismData) -> dict[str, ForceKinematics
     }
 
 
+class Invariants(NamedTuple):
+    """What stays as it is in an exact motion, at n states.
+
+    Attributes
+    ----------
+    position, rate : (n, rows)
+        As of :meth:`Observables.closure_errors`.
+    energies : (n, 2)
+        As of :meth:`Observables.energies`.
+    """
+
+    position: FloatArray
+    rate: FloatArray
+    energies: FloatArray
+
+
 class Observables:
     """Quantities of the mechanism of ``system`` at n states.
 
@@ -78,6 +94,10 @@ class Observables:
     ) -> tuple[FloatArray, FloatArray]:
         """g - s (n, rows) in m and rad, and G v - s' (n, rows), of all rows."""
         return constraint_errors(self.mechanism, t, q, v)
+
+    def invariants(self, t: FloatArray, q: FloatArray, v: FloatArray) -> Invariants:
+        """Closure errors and energies."""
+        return Invariants(*self.closure_errors(t, q, v), self.energies(q, v))
 
     def jacobians(self, t: FloatArray, q: FloatArray) -> FloatArray:
         """G (n, rows, nv) of all rows; with drives [G, -s'] (n, rows, nv + 1)."""

@@ -80,21 +80,27 @@ class EnergyBalance:
     @cached_property
     def residual(self) -> FloatArray:
         """Energy gained minus all works (n,) J: the error of the run, and of this balance."""
-        done: FloatArray = sum(self.works.values(), start=np.zeros(len(self.t)))
-        return self.kinetic + self.potential - self.start - done
+        residual: FloatArray = self.kinetic + self.potential - self.start
+        for done in self.works.values():
+            residual -= done
+        return residual
+
+    @cached_property
+    def largest_residual(self) -> float:
+        """Largest absolute value of the residual (J)."""
+        return _largest(self.residual)
 
     @cached_property
     def scale(self) -> float:
         """The energy (J) that took part: the largest of kinetic energy, change of potential energy
         and each work."""
         sizes = [self.kinetic, self.potential - self.potential[:1], *self.works.values()]
-        return max((float(np.abs(values).max(initial=0.0)) for values in sizes), default=0.0)
+        return max(map(_largest, sizes))
 
     @property
     def relative(self) -> float:
         """Largest residual over the scale; 0 where nothing moved but for rounding."""
-        largest = float(np.abs(self.residual).max(initial=0.0))
-        return largest / self.scale if self.scale > self.rounding else 0.0
+        return self.largest_residual / self.scale if self.scale > self.rounding else 0.0
 
 
 _System = OpenSystem | ClosedSystem
@@ -105,6 +111,7 @@ class BalancedRun(Protocol):
 
     mechanism: Mechanism
     scheme: ButcherTableau
+    t_eval: FloatArray | None
 
     @property
     def t(self) -> FloatArray:
@@ -125,6 +132,10 @@ class BalancedRun(Protocol):
     @property
     def observables(self) -> Observables:
         """Quantities at many states of the mechanism."""
+
+    @property
+    def energies(self) -> FloatArray:
+        """Kinetic and potential energy (n, 2) J."""
 
     @property
     def energy_balance(self) -> EnergyBalance:
@@ -288,25 +299,32 @@ def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
     EvaluationError
         If a force cannot be evaluated.
     """
-    times = solution.steps.times
-    ends = np.unique(np.concatenate([times[times < solution.steps.end], solution.t]))
-    if times[0] < ends[0]:
-        ends = np.concatenate([times[:1], ends])
+    ends, energies = solution.t, solution.energies
+    place: IndexArray | slice = slice(None)
+    if solution.t_eval is None:  # the ends of the steps
+        first = energies[:1]
+    else:
+        times, first = solution.steps.times, solution.steps.states[:1]
+        ends = np.unique(np.concatenate([times[times < solution.steps.end], ends]))
+        if times[0] < ends[0]:
+            ends = np.concatenate([times[:1], ends])
+        place = np.searchsorted(ends, solution.t)
+        nq = solution.mechanism.model.nq
+        first = solution.observables.energies(first[:, :nq], first[:, nq:])
     nodes = Nodes(solution, system, ends)
     works = {}
-    place = np.searchsorted(ends, solution.t)
     for term in TERMS:
         for name, power in term(nodes, system).items():
             works[name] = np.concatenate([[0.0], np.cumsum(nodes.work(power))])[place]
-    nq = solution.mechanism.model.nq
-    first = solution.steps.states[:1]
-    q = np.concatenate((first[:, :nq], solution.q))
-    energies = solution.observables.energies(q, np.concatenate((first[:, nq:], solution.v)))
-    start, energies = float(energies[0].sum()), energies[1:]
+    start = float(first.sum())
     kinetic, potential = energies.T
-    sums = [[start], kinetic, energies.sum(axis=1)]
-    rounding = _rounding(solution.mechanism, np.concatenate(sums))
+    largest = max(abs(start), _largest(kinetic), _largest(kinetic + potential))
+    rounding = _rounding(solution.mechanism, largest)
     return EnergyBalance(solution.t, kinetic, potential, KnownKeys(works), start, rounding)
+
+
+def _largest(values: FloatArray) -> float:
+    return float(np.abs(values).max(initial=0.0))
 
 
 @per_model
@@ -316,9 +334,9 @@ def _weight(mechanism: Mechanism) -> float:
     return mass * float(np.linalg.norm(mechanism.model.gravity.linear))
 
 
-def _rounding(mechanism: Mechanism, energies: FloatArray) -> float:
-    """Rounding error (J) of sums of these energies, whose zero is where potentials cancel."""
-    largest = float(np.abs(energies).max(initial=0.0))
+def _rounding(mechanism: Mechanism, largest: float) -> float:
+    """Rounding error (J) of sums of energies up to the ``largest``, whose zero is where potentials
+    cancel."""
     return float(
         RELATIVE_ROUNDING * (_weight(mechanism) * mechanism.structure.units.length + largest)
     )

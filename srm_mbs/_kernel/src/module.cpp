@@ -4,6 +4,7 @@
 #include <limits>
 #include <map>
 #include <memory>
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -214,16 +215,23 @@ struct PySystem {
         return n;
     }
 
-    // g - s and G v - s' (n, rows).
-    nb::tuple closure_errors(const Array& t, const Array& states) {
+    // g - s and G v - s' (n, rows); with_energies: and kinetic and potential energy (n, 2).
+    nb::tuple closure_errors(const Array& t, const Array& states, bool with_energies) {
         const std::size_t n = count_of(t, states, state_size()), nx = state_size();
         const auto rows = static_cast<std::size_t>(system->rows());
-        std::vector<double> g(n * rows), rates(n * rows);
-        for (std::size_t i = 0; i < n; ++i)
-            system->closure_errors(t.data()[i], states.data() + i * nx, g.data() + i * rows,
+        std::vector<double> g(n * rows), rates(n * rows), energies(with_energies ? 2 * n : 0);
+        for (std::size_t i = 0; i < n; ++i) {
+            const double* const state = states.data() + i * nx;
+            system->closure_errors(t.data()[i], state, g.data() + i * rows,
                                    rates.data() + i * rows);
-        return nb::make_tuple(owned_array(std::move(g), {n, rows}),
-                              owned_array(std::move(rates), {n, rows}));
+            if (!with_energies) continue;
+            const auto found = system->energies(state, true);
+            std::copy(found.begin(), found.end(), energies.begin() + 2 * i);
+        }
+        const nb::object errors = owned_array(std::move(g), {n, rows});
+        const nb::object of_rates = owned_array(std::move(rates), {n, rows});
+        if (!with_energies) return nb::make_tuple(errors, of_rates);
+        return nb::make_tuple(errors, of_rates, owned_array(std::move(energies), {n, 2}));
     }
 
     // The largest |g - s| and |G v - s'| at q (nq,) and v (nv,), over the units (rows,) of the rows;
@@ -601,7 +609,8 @@ void bind_system(nb::module_& m) {
              [](PySystem& s, double t, const Array& state) {
                  s.system->begin_step(t, vector_of(state, s.state_size(), "state"));
              })
-        .def("closure_errors", &PySystem::closure_errors)
+        .def("closure_errors", &PySystem::closure_errors, nb::arg("t"), nb::arg("states"),
+             nb::arg("with_energies") = false)
         .def("largest_errors", &PySystem::largest_errors, nb::arg("t"), nb::arg("q"), nb::arg("v"),
              nb::arg("unit"))
         .def("jacobians", &PySystem::jacobians)
@@ -1196,6 +1205,15 @@ void bind_run(nb::module_& m) {
                                                any(s.stiff));
                      })
         .def_prop_ro("break_count", [](const PyRecords& r) { return r.records.breaks.size(); })
+        // Whether dense output needs no more than the records: no breakpoint and no zone, and no
+        // step past a critical configuration.
+        .def_prop_ro("plain",
+                     [](const PyRecords& r) {
+                         const StepRecords& s = r.records;
+                         const auto& placed = s.placements;
+                         return s.breaks.empty() && s.zones.empty() &&
+                                std::count(placed.begin(), placed.end(), s.critical) == 0;
+                     })
         .def_prop_ro("end_rate", [](const PyRecords& r) { return owned_array(r.end_rate); })
         .def_prop_ro("zones", [](const PyRecords& r) { return r.records.zones; });
 
@@ -1323,8 +1341,29 @@ struct PySteps {
     }
 };
 
+// The steps of `records`, in the memory of these, of a run that ended at `end` (s): without
+// breakpoints, zones and layers.
+StepArrays arrays(const PyRecords& records, double end) {
+    const StepRecords& r = records.records;
+    StepArrays out;
+    out.count = static_cast<long>(r.ranks.size());
+    out.end = end;
+    out.width = static_cast<int>(records.stages);
+    out.corrected = records.corrected > 0;
+    out.times = r.times.data();
+    out.states = r.states.data();
+    out.rates = r.rates.data();
+    out.corrections = r.corrections.data();
+    out.sigmas = r.sigmas.data();
+    out.end_rate = records.end_rate.data();
+    out.stiff.assign(r.stiff.begin(), r.stiff.end());
+    out.in_zone.assign(r.ranks.size(), 0);
+    return out;
+}
+
 struct PyDense {
-    PySteps steps;  // kept alive
+    nb::object records;  // kept alive, as the arrays of `steps`
+    std::optional<PySteps> steps;
     DenseOutput dense;
     std::size_t nx;
 
@@ -1332,8 +1371,23 @@ struct PyDense {
             const DenseConstants& constants, const PySteps& steps_)
         : steps(steps_),
           dense(nq, nv, schemes, constants,
-                steps.arrays(nq, nv, schemes.empty() ? 0 : schemes[0].abscissae.size())),
+                steps->arrays(nq, nv, schemes.empty() ? 0 : schemes[0].abscissae.size())),
           nx(static_cast<std::size_t>(nq + nv)) {}
+
+    PyDense(const std::vector<SchemeDense>& schemes, const DenseConstants& constants,
+            nb::object records_, double end)
+        : PyDense(schemes, constants, nb::cast<const PyRecords&>(records_), end) {
+        records = std::move(records_);
+    }
+
+    PyDense(const std::vector<SchemeDense>& schemes, const DenseConstants& constants,
+            const PyRecords& from, double end)
+        : dense(static_cast<int>(from.nx - from.n / 2), static_cast<int>(from.n / 2), schemes,
+                constants, arrays(from, end)),
+          nx(from.nx) {
+        const std::size_t stages = schemes[0].abscissae.size();
+        if (stages != from.stages) throw nb::value_error("the records have another number of stages");
+    }
 
     nb::object states(PySystem& owner, const Array& t) {
         const std::size_t k = t.size();
@@ -1359,6 +1413,8 @@ void bind_dense_output(nb::module_& m) {
                       const PySteps&>(),
              nb::arg("nq"), nb::arg("nv"), nb::arg("schemes"), nb::arg("constants"),
              nb::arg("steps"))
+        .def(nb::init<const std::vector<SchemeDense>&, const DenseConstants&, nb::object, double>(),
+             nb::arg("schemes"), nb::arg("constants"), nb::arg("records"), nb::arg("end"))
         .def("states", &PyDense::states)
         .def("between_ends", &PyDense::between_ends);
 }

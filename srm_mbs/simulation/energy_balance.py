@@ -21,7 +21,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from srm_mbs._typing import BoolArray, FloatArray, IndexArray
+from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.observables import LINEAR, Observables, working_elements
@@ -221,23 +221,27 @@ class Nodes:
         if len(self._read_at):
             run = self.run
             parts.append(self.observables.powers(run.t, run.q, run.v))
+        if len(parts) == 1:
+            return {name: power.ravel() for name, power in parts[0].items()}
         return {name: np.concatenate([part[name].ravel() for part in parts]) for name in parts[0]}
 
-    @cached_property
-    def _weights(self) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """The intervals (n,) with stages, and the weights (n, nodes) s of the nodes of these and of
-        the others."""
+    def works(self, powers: Powers) -> Powers:
+        """Work (n + 1,) J up to each of the ends by each of the ``powers`` (k,) W."""
+        if not powers:
+            return {}
+        power = np.array(list(powers.values()))
         at_stages, lengths = self._steps >= 0, np.diff(self._ends)
-        stages = np.outer(lengths[at_stages], self._scheme.b[self._stages])
-        return at_stages, stages, np.outer(lengths[~at_stages], 0.5 * self._gauss[1])
-
-    def work(self, power: FloatArray) -> FloatArray:
-        """Work (n,) J in each interval of the ``power`` (k,) W."""
-        at_stages, stages, read = self._weights
-        out = np.empty(len(at_stages))
-        out[at_stages] = (power[: stages.size].reshape(stages.shape) * stages).sum(axis=1)
-        out[~at_stages] = (power[stages.size :].reshape(read.shape) * read).sum(axis=1)
-        return out
+        nodes = len(self._started) * len(self._stages)
+        out = np.zeros((len(powers), len(self._ends)))
+        gained = out[:, 1:]
+        for chosen, weights, own in (
+            (at_stages, self._scheme.b[self._stages], power[:, :nodes]),
+            (~at_stages, 0.5 * self._gauss[1], power[:, nodes:]),
+        ):
+            if own.size:
+                mean = own.reshape(len(own), -1, len(weights)) @ weights
+                gained[:, chosen] = lengths[chosen] * mean
+        return dict(zip(powers, np.cumsum(out, axis=1)))
 
 
 def _controller(nodes: Nodes, system: _System) -> Powers:
@@ -312,10 +316,8 @@ def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
         nq = solution.mechanism.model.nq
         first = solution.observables.energies(first[:, :nq], first[:, nq:])
     nodes = Nodes(solution, system, ends)
-    works = {}
-    for term in TERMS:
-        for name, power in term(nodes, system).items():
-            works[name] = np.concatenate([[0.0], np.cumsum(nodes.work(power))])[place]
+    powers = {name: one for term in TERMS for name, one in term(nodes, system).items()}
+    works = {name: work[place] for name, work in nodes.works(powers).items()}
     start = float(first.sum())
     kinetic, potential = energies.T
     largest = max(abs(start), _largest(kinetic), _largest(kinetic + potential))

@@ -64,7 +64,7 @@ def conservative_elements(mechanism: MechanismData) -> dict[str, ForceKinematics
 
 
 class Invariants(NamedTuple):
-    """What stays as it is in an exact motion, at n states.
+    """Closure errors and energies at n states, which show the error of a motion.
 
     Attributes
     ----------
@@ -142,6 +142,22 @@ class Observables:
             return out
         pairs = zip(states, motions)
         return np.array([self.system.retract(*pair) for pair in pairs]).reshape(states.shape)
+
+    @staticmethod
+    def largest_entries(
+        x: FloatArray, unit: FloatArray, order: list[int], starts: list[int]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Of motions and changes of the rates x (n, 2 nv) the largest of either over its ``unit``
+        (2 nv,), as (n, 2), and the largest norm (m,) at any time of each group of entries.
+
+        Parameters
+        ----------
+        order, starts
+            Indices (2 nv,) of the entries, one group after the other, and where the m groups begin.
+        """
+        size = np.maximum.reduceat(np.abs(x / unit), [0, len(unit) // 2], axis=1)
+        squares = np.add.reduceat(x[:, order] ** 2, starts, axis=1)
+        return size, np.sqrt(squares.max(axis=0, initial=0.0))
 
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         """Kinetic and potential energy (n, 2) J: of the bodies; of gravity, springs and

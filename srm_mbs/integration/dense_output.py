@@ -354,8 +354,8 @@ class StepData:
         """Which steps (n,) are explicit ones of ``scheme`` whose stages lie on the motion, to their
         order: away from singular configurations."""
         explicit = scheme.member(False)
-        out = np.full(self.count, explicit.implicit is None)
-        out &= (self.stiff == 0.0) & ~close_to_singular(explicit.abscissae, self.sigmas)
+        out = ~close_to_singular(explicit.abscissae, self.sigmas)
+        out &= (self.stiff == 0.0) & (explicit.implicit is None)
         out[self.between_nodes] = False
         return out
 

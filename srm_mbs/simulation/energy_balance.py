@@ -95,7 +95,7 @@ class EnergyBalance:
         """The energy (J) that took part: the largest of kinetic energy, change of potential energy
         and each work."""
         sizes = [self.kinetic, self.potential - self.potential[:1], *self.works.values()]
-        return max(map(_largest, sizes))
+        return _largest(np.array(sizes))
 
     @property
     def relative(self) -> float:
@@ -172,9 +172,12 @@ class Nodes:
         out = np.full(len(ends) - 1, -1)
         if not (self._smooth and len(self._scheme.dense.extra_c) and steps.count):
             return out
+        with_stages = steps.with_stages(self._run.scheme)
+        if self._run.t_eval is None and steps.stop is None:  # all intervals are steps
+            return np.where(with_stages, np.arange(steps.count), out)
         step = np.clip(np.searchsorted(steps.times, ends[:-1]), 0, steps.count - 1)
         whole = (steps.times[step] == ends[:-1]) & (steps.times[step + 1] == ends[1:])
-        return np.where(whole & steps.with_stages(self._run.scheme)[step], step, out)
+        return np.where(whole & with_stages[step], step, out)
 
     @cached_property
     def _started(self) -> IndexArray:
@@ -185,6 +188,8 @@ class Nodes:
     def _read_at(self) -> FloatArray:
         """Times (k,) s that are read."""
         read, (points, _) = self._steps < 0, self._gauss
+        if not np.logical_or.reduce(read):
+            return np.zeros(0)
         starts, lengths = self._ends[:-1][read], np.diff(self._ends)[read]
         return (starts[:, None] + np.outer(lengths, 0.5 * (points + 1.0))).ravel()
 

@@ -26,6 +26,7 @@
 #include "linear.hpp"
 #include "manifold.hpp"
 #include "model.hpp"
+#include "processor.hpp"
 #include "run.hpp"
 #include "separated_rows.hpp"
 #include "struct_binding.hpp"
@@ -55,6 +56,18 @@ std::vector<double> numbers(nb::handle array, int size, const char* name) {
 
 std::vector<double> optional_vector(nb::handle object) {
     return object.is_none() ? std::vector<double>{} : to_vector(object);
+}
+
+// h times the sum (n,) of the rows (count, n) with these weights (count,).
+SRM_FOR_PROCESSOR
+void weighted_sum(const double* weights, std::size_t count, double h, const double* rows,
+                  std::size_t n, double* __restrict__ out) {
+    std::fill_n(out, n, 0.0);
+    for (std::size_t j = 0; j < count; ++j, rows += n) {
+        const double weight = h * weights[j];
+        if (weight == 0.0) continue;
+        for (std::size_t k = 0; k < n; ++k) out[k] += weight * rows[k];
+    }
 }
 
 // A view of `values`, which `owner` keeps alive.
@@ -475,10 +488,7 @@ struct PySystem {
             const double h = times.data()[step + 1] - times.data()[step];
             const double* const own = rates.data() + step * width * n;
             for (std::size_t i = 0; i < stages; ++i) {
-                std::fill(moved.begin(), moved.end(), 0.0);
-                for (std::size_t j = 0; j < s; ++j)
-                    if (const double a = A.data()[i * s + j]; a != 0.0)
-                        add(h * a, own + j * n, moved.data(), static_cast<int>(n));
+                weighted_sum(A.data() + i * s, s, h, own, n, moved.data());
                 system->retract(states.data() + step * nx, moved.data(), &x[i * nx]);
                 t[i] = times.data()[step] + h * c.data()[i];
             }
@@ -1273,6 +1283,34 @@ void bind_run(nb::module_& m) {
         .def_prop_ro("replaced", [](const PyRun& r) { return r.run->control->replaced; });
 }
 
+// Of the rows of x (n, 2 nv) the largest entry of either half over its unit (n, 2), and the largest
+// norm (m,) in any row of each group of entries order[starts[i]], ..., order[starts[i + 1] - 1].
+nb::tuple largest_entries(const Array& x, const Array& unit, const std::vector<int>& order,
+                          const std::vector<int>& starts) {
+    const std::size_t width = unit.size(), n = x.shape(0), groups = starts.size();
+    if (x.ndim() != 2 || x.shape(1) != width || width % 2 != 0 || order.size() != width)
+        throw nb::value_error("x, unit or order has another shape");
+    expect_within("order", order, 0, static_cast<int>(width) - 1);
+    expect_within("starts", starts, 0, static_cast<int>(width) - 1);
+    std::vector<double> size(2 * n), norms(groups);
+    const auto take = [](double value, double& largest) {  // nothing is larger than NaN
+        if (value > largest || std::isnan(value)) largest = value;
+    };
+    const double* row = x.data();
+    for (std::size_t i = 0; i < n; ++i, row += width) {
+        for (std::size_t k = 0; k < width; ++k)
+            take(std::abs(row[k] / unit.data()[k]), size[2 * i + (2 * k >= width)]);
+        for (std::size_t g = 0; g < groups; ++g) {
+            const std::size_t end = g + 1 < groups ? starts[g + 1] : width;
+            double square = 0.0;
+            for (std::size_t k = starts[g]; k < end; ++k) square += row[order[k]] * row[order[k]];
+            take(square, norms[g]);
+        }
+    }
+    for (double& norm : norms) norm = std::sqrt(norm);
+    return nb::make_tuple(owned_array(std::move(size), {n, 2}), owned_array(std::move(norms)));
+}
+
 // ---- Dense output -------------------------------------------------------------------------------
 
 #define SRM_PY_STEPS(field)                                                           \
@@ -1408,6 +1446,7 @@ struct PyDense {
 
 void bind_dense_output(nb::module_& m) {
     bind_struct<PySteps>(m, "StepArrays");
+    m.def("largest_entries", &largest_entries);
     nb::class_<PyDense>(m, "DenseOutput")
         .def(nb::init<int, int, const std::vector<SchemeDense>&, const DenseConstants&,
                       const PySteps&>(),

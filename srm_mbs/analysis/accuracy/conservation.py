@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -77,7 +78,7 @@ def _rows_by_unit(mechanism: Mechanism) -> list[tuple[str, BoolArray | slice, fl
 
 def _largest_norm(errors: FloatArray) -> float:
     """Of the rows of ``errors`` (n, k)."""
-    return float(np.sqrt(np.einsum("ij,ij->i", errors, errors).max(initial=0.0)))
+    return math.sqrt(np.maximum.reduce(np.add.reduce(errors * errors, axis=1)))
 
 
 def drift_of(samples: Sequence[Samples]) -> tuple[Drift, ...]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs._typing import BoolArray, FloatArray, IndexArray
+from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.analysis.accuracy.samples import Samples, sample_states, sample_times
 from srm_mbs.dynamics.scaling import angle_coordinates
 from srm_mbs.errors import InputError
@@ -415,8 +415,9 @@ class Differences(Sizes):
         As in :class:`Sizes`.
     jumps
         As in :class:`Comparison`.
-    apart : (n, 2 nv)
-        Motions from one to the other, and changes of the rates.
+    norms : (2 k,)
+        The largest norm at any time of the motion from one to the other of each of k parts of the
+        joints (:class:`Parts`), and of the change of its rates.
     states : (n, nq + nv)
         Those of the first one.
     run
@@ -424,26 +425,24 @@ class Differences(Sizes):
     """
 
     jumps: FloatArray
-    apart: FloatArray
+    norms: FloatArray
     states: FloatArray
     run: SimulationResult
 
     def comparison(self) -> Comparison:
         """With the largest difference of each joint."""
         mechanism, run, states = self.run.mechanism, self.run, self.states
-        model = mechanism.model
-        start = np.repeat(states[:1], len(states), axis=0)
-        moved = run.segments[0].observables.differences(start, states)
+        model, observables = mechanism.model, run.segments[0].observables
+        moved = observables.differences(np.repeat(states[:1], len(states), axis=0), states)
         moved[:, model.nv :] = states[:, model.nq :]
         for name, k in _turning_joints(mechanism):
             angle = run.unwrapped(name, self.t, states)
             moved[:, k] = angle - angle[:1]
         parts = _parts(mechanism)
-        # The norm over the coordinates of each part, at the time at which it is largest.
-        largest = parts.largest_norms(self.apart) + parts.largest_norms(moved)
-        joints = tuple(
-            JointDifference(*own, *numbers) for own, *numbers in zip(parts.names, *largest)
-        )
+        units = mechanism.structure.units.state
+        _, norms = observables.largest_entries(moved, units, parts.order, parts.starts)
+        numbers = np.concatenate((self.norms, norms)).reshape(4, -1).T.tolist()
+        joints = tuple(JointDifference(*own, *each) for own, each in zip(parts.names, numbers))
         return Comparison(self.t, self.size, joints, self.jumps)
 
 
@@ -459,14 +458,14 @@ def compare(
     if len(run.segments) > 1 or len(other.segments) > 1:
         allowed, jumps = _between_jumps(run, other, times)
         times = times[allowed]
-    mechanism, nv = run.mechanism, run.mechanism.model.nv
+    mechanism, observables = run.mechanism, run.segments[0].observables
     a, b = read(run, times), read(other, times)
-    apart = run.segments[0].observables.differences(a, b)
+    apart = observables.differences(a, b)
     for name, k in _turning_joints(mechanism):
         apart[:, k] = other.unwrapped(name, times, b) - run.unwrapped(name, times, a)
-    parts = np.abs(apart / mechanism.structure.units.state)
-    size = np.maximum.reduceat(parts, [0, nv], axis=1)
-    return Differences(times, size, jumps, apart, a, run)
+    parts, units = _parts(mechanism), mechanism.structure.units.state
+    size, norms = observables.largest_entries(apart, units, parts.order, parts.starts)
+    return Differences(times, size, jumps, norms, a, run)
 
 
 @dataclass(frozen=True, eq=False)
@@ -480,23 +479,12 @@ class Parts:
     order : (2 nv,)
         Indices of their coordinates, one part after the other, and those of their rates.
     starts
-        Where they begin in ``order``; None if each has one coordinate.
+        Where the coordinates and the rates of each begin in ``order``.
     """
 
     names: list[tuple[str, str]]
-    order: IndexArray
-    starts: IndexArray | None
-
-    def largest_norms(self, x: FloatArray) -> tuple[list[float], list[float]]:
-        """Of the coordinates of each part, and of their rates, in the rows of x (n, 2 nv) the
-        largest norm in any row."""
-        if self.starts is None:
-            largest = np.abs(x).max(axis=0, initial=0.0)[self.order]
-        else:
-            squares = np.add.reduceat(x[:, self.order] ** 2, self.starts, axis=1)
-            largest = np.sqrt(squares.max(axis=0, initial=0.0))
-        found: list[float] = largest.tolist()
-        return found[: len(self.names)], found[len(self.names) :]
+    order: list[int]
+    starts: list[int]
 
 
 @per_model
@@ -518,11 +506,9 @@ def _parts(mechanism: MechanismData) -> Parts:
             if len(chosen):
                 names.append((name, unit))
                 indices.append(chosen)
-    nv = mechanism.model.nv
-    indices += [nv + own for own in indices]
+    indices += [mechanism.model.nv + own for own in indices]
     starts = np.cumsum([0, *(len(own) for own in indices[:-1])])
-    single = len(indices) == 2 * nv
-    return Parts(names, np.concatenate(indices), None if single else starts)
+    return Parts(names, np.concatenate(indices).tolist(), starts.tolist())
 
 
 def _jump_times(run: SimulationResult) -> Sequence[float]:

@@ -205,6 +205,13 @@ class CompiledObservables(Observables):
         with self._all_rows() as kernel_system:
             return kernel_system.moved(states, motions)  # type: ignore[no-any-return]
 
+    @staticmethod
+    def largest_entries(
+        x: FloatArray, unit: FloatArray, order: list[int], starts: list[int]
+    ) -> tuple[FloatArray, FloatArray]:
+        """As the reference."""
+        return core.largest_entries(x, unit, order, starts)  # type: ignore[no-any-return,union-attr]
+
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         with self._all_rows() as kernel_system:
             return kernel_system.energies(np.concatenate((q, v), axis=1))  # type: ignore[no-any-return]

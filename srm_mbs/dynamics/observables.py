@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -63,6 +63,22 @@ def conservative_elements(mechanism: MechanismData) -> dict[str, ForceKinematics
     }
 
 
+class Invariants(NamedTuple):
+    """Closure errors and energies at n states, which show the error of a motion.
+
+    Attributes
+    ----------
+    position, rate : (n, rows)
+        As of :meth:`Observables.closure_errors`.
+    energies : (n, 2)
+        As of :meth:`Observables.energies`.
+    """
+
+    position: FloatArray
+    rate: FloatArray
+    energies: FloatArray
+
+
 class Observables:
     """Quantities of the mechanism of ``system`` at n states.
 
@@ -78,6 +94,10 @@ class Observables:
     ) -> tuple[FloatArray, FloatArray]:
         """g - s (n, rows) in m and rad, and G v - s' (n, rows), of all rows."""
         return constraint_errors(self.mechanism, t, q, v)
+
+    def invariants(self, t: FloatArray, q: FloatArray, v: FloatArray) -> Invariants:
+        """Closure errors and energies."""
+        return Invariants(*self.closure_errors(t, q, v), self.energies(q, v))
 
     def jacobians(self, t: FloatArray, q: FloatArray) -> FloatArray:
         """G (n, rows, nv) of all rows; with drives [G, -s'] (n, rows, nv + 1)."""
@@ -122,6 +142,22 @@ class Observables:
             return out
         pairs = zip(states, motions)
         return np.array([self.system.retract(*pair) for pair in pairs]).reshape(states.shape)
+
+    @staticmethod
+    def largest_entries(
+        x: FloatArray, unit: FloatArray, order: list[int], starts: list[int]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Of motions and changes of the rates x (n, 2 nv) the largest of either over its ``unit``
+        (2 nv,), as (n, 2), and the largest norm (m,) at any time of each group of entries.
+
+        Parameters
+        ----------
+        order, starts
+            Indices (2 nv,) of the entries, one group after the other, and where the m groups begin.
+        """
+        size = np.maximum.reduceat(np.abs(x / unit), [0, len(unit) // 2], axis=1)
+        squares = np.add.reduceat(x[:, order] ** 2, starts, axis=1)
+        return size, np.sqrt(squares.max(axis=0, initial=0.0))
 
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         """Kinetic and potential energy (n, 2) J: of the bodies; of gravity, springs and

@@ -354,8 +354,8 @@ class StepData:
         """Which steps (n,) are explicit ones of ``scheme`` whose stages lie on the motion, to their
         order: away from singular configurations."""
         explicit = scheme.member(False)
-        out = np.full(self.count, explicit.implicit is None)
-        out &= (self.stiff == 0.0) & ~close_to_singular(explicit.abscissae, self.sigmas)
+        out = ~close_to_singular(explicit.abscissae, self.sigmas)
+        out &= (self.stiff == 0.0) & (explicit.implicit is None)
         out[self.between_nodes] = False
         return out
 
@@ -455,7 +455,7 @@ class DenseOutput:
     scheme
         The tableau of the run.
     steps
-        The accepted steps.
+        The accepted steps, or a function that returns them when they are first read.
     end_state : (nx,)
         State at the end of the run, if it is known.
 
@@ -471,16 +471,19 @@ class DenseOutput:
         self,
         system: System,
         scheme: ButcherTableau,
-        steps: StepData,
+        steps: StepData | Callable[[], StepData],
         end_state: FloatArray | None = None,
     ) -> None:
         self._system = system
         self._end_state = end_state
         self._scheme = scheme
-        self._members = tuple(scheme.member(stiff) for stiff in (False, True))
         self._smooth: dict[int, HermiteStep] = {}
-        self._steps = steps
+        self._source = steps
         self._extra: dict[int, FloatArray] = {}
+
+    @cached_property
+    def _steps(self) -> StepData:
+        return self._source if isinstance(self._source, StepData) else self._source()
 
     @cached_property
     def observables(self) -> Observables:
@@ -558,7 +561,7 @@ class DenseOutput:
         """The steps with the rates of all stages that dense output needs: for a reader without the
         controller."""
         data = self._steps
-        count = max(scheme.dense.n_rates for scheme in self._members)
+        count = max(self._scheme.member(stiff).dense.n_rates for stiff in (False, True))
         if not data.count or data.rates.shape[1] == count:
             return data
         rates = np.zeros((data.count, count, data.rates.shape[2]))

@@ -21,7 +21,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from srm_mbs._typing import BoolArray, FloatArray, IndexArray
+from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.observables import LINEAR, Observables, working_elements
@@ -80,21 +80,27 @@ class EnergyBalance:
     @cached_property
     def residual(self) -> FloatArray:
         """Energy gained minus all works (n,) J: the error of the run, and of this balance."""
-        done: FloatArray = sum(self.works.values(), start=np.zeros(len(self.t)))
-        return self.kinetic + self.potential - self.start - done
+        residual: FloatArray = self.kinetic + self.potential - self.start
+        for done in self.works.values():
+            residual -= done
+        return residual
+
+    @cached_property
+    def largest_residual(self) -> float:
+        """Largest absolute value of the residual (J)."""
+        return _largest(self.residual)
 
     @cached_property
     def scale(self) -> float:
         """The energy (J) that took part: the largest of kinetic energy, change of potential energy
         and each work."""
         sizes = [self.kinetic, self.potential - self.potential[:1], *self.works.values()]
-        return max((float(np.abs(values).max(initial=0.0)) for values in sizes), default=0.0)
+        return _largest(np.array(sizes))
 
     @property
     def relative(self) -> float:
         """Largest residual over the scale; 0 where nothing moved but for rounding."""
-        largest = float(np.abs(self.residual).max(initial=0.0))
-        return largest / self.scale if self.scale > self.rounding else 0.0
+        return self.largest_residual / self.scale if self.scale > self.rounding else 0.0
 
 
 _System = OpenSystem | ClosedSystem
@@ -105,6 +111,7 @@ class BalancedRun(Protocol):
 
     mechanism: Mechanism
     scheme: ButcherTableau
+    t_eval: FloatArray | None
 
     @property
     def t(self) -> FloatArray:
@@ -125,6 +132,10 @@ class BalancedRun(Protocol):
     @property
     def observables(self) -> Observables:
         """Quantities at many states of the mechanism."""
+
+    @property
+    def energies(self) -> FloatArray:
+        """Kinetic and potential energy (n, 2) J."""
 
     @property
     def energy_balance(self) -> EnergyBalance:
@@ -161,9 +172,12 @@ class Nodes:
         out = np.full(len(ends) - 1, -1)
         if not (self._smooth and len(self._scheme.dense.extra_c) and steps.count):
             return out
+        with_stages = steps.with_stages(self._run.scheme)
+        if self._run.t_eval is None and steps.stop is None:  # all intervals are steps
+            return np.where(with_stages, np.arange(steps.count), out)
         step = np.clip(np.searchsorted(steps.times, ends[:-1]), 0, steps.count - 1)
         whole = (steps.times[step] == ends[:-1]) & (steps.times[step + 1] == ends[1:])
-        return np.where(whole & steps.with_stages(self._run.scheme)[step], step, out)
+        return np.where(whole & with_stages[step], step, out)
 
     @cached_property
     def _started(self) -> IndexArray:
@@ -174,6 +188,8 @@ class Nodes:
     def _read_at(self) -> FloatArray:
         """Times (k,) s that are read."""
         read, (points, _) = self._steps < 0, self._gauss
+        if not np.logical_or.reduce(read):
+            return np.zeros(0)
         starts, lengths = self._ends[:-1][read], np.diff(self._ends)[read]
         return (starts[:, None] + np.outer(lengths, 0.5 * (points + 1.0))).ravel()
 
@@ -210,23 +226,27 @@ class Nodes:
         if len(self._read_at):
             run = self.run
             parts.append(self.observables.powers(run.t, run.q, run.v))
+        if len(parts) == 1:
+            return {name: power.ravel() for name, power in parts[0].items()}
         return {name: np.concatenate([part[name].ravel() for part in parts]) for name in parts[0]}
 
-    @cached_property
-    def _weights(self) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """The intervals (n,) with stages, and the weights (n, nodes) s of the nodes of these and of
-        the others."""
+    def works(self, powers: Powers) -> Powers:
+        """Work (n + 1,) J up to each of the ends by each of the ``powers`` (k,) W."""
+        if not powers:
+            return {}
+        power = np.array(list(powers.values()))
         at_stages, lengths = self._steps >= 0, np.diff(self._ends)
-        stages = np.outer(lengths[at_stages], self._scheme.b[self._stages])
-        return at_stages, stages, np.outer(lengths[~at_stages], 0.5 * self._gauss[1])
-
-    def work(self, power: FloatArray) -> FloatArray:
-        """Work (n,) J in each interval of the ``power`` (k,) W."""
-        at_stages, stages, read = self._weights
-        out = np.empty(len(at_stages))
-        out[at_stages] = (power[: stages.size].reshape(stages.shape) * stages).sum(axis=1)
-        out[~at_stages] = (power[stages.size :].reshape(read.shape) * read).sum(axis=1)
-        return out
+        nodes = len(self._started) * len(self._stages)
+        out = np.zeros((len(powers), len(self._ends)))
+        gained = out[:, 1:]
+        for chosen, weights, own in (
+            (at_stages, self._scheme.b[self._stages], power[:, :nodes]),
+            (~at_stages, 0.5 * self._gauss[1], power[:, nodes:]),
+        ):
+            if own.size:
+                mean = own.reshape(len(own), -1, len(weights)) @ weights
+                gained[:, chosen] = lengths[chosen] * mean
+        return dict(zip(powers, np.cumsum(out, axis=1)))
 
 
 def _controller(nodes: Nodes, system: _System) -> Powers:
@@ -288,25 +308,30 @@ def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
     EvaluationError
         If a force cannot be evaluated.
     """
-    times = solution.steps.times
-    ends = np.unique(np.concatenate([times[times < solution.steps.end], solution.t]))
-    if times[0] < ends[0]:
-        ends = np.concatenate([times[:1], ends])
+    ends, energies = solution.t, solution.energies
+    place: IndexArray | slice = slice(None)
+    if solution.t_eval is None:  # the ends of the steps
+        first = energies[:1]
+    else:
+        times, first = solution.steps.times, solution.steps.states[:1]
+        ends = np.unique(np.concatenate([times[times < solution.steps.end], ends]))
+        if times[0] < ends[0]:
+            ends = np.concatenate([times[:1], ends])
+        place = np.searchsorted(ends, solution.t)
+        nq = solution.mechanism.model.nq
+        first = solution.observables.energies(first[:, :nq], first[:, nq:])
     nodes = Nodes(solution, system, ends)
-    works = {}
-    place = np.searchsorted(ends, solution.t)
-    for term in TERMS:
-        for name, power in term(nodes, system).items():
-            works[name] = np.concatenate([[0.0], np.cumsum(nodes.work(power))])[place]
-    nq = solution.mechanism.model.nq
-    first = solution.steps.states[:1]
-    q = np.concatenate((first[:, :nq], solution.q))
-    energies = solution.observables.energies(q, np.concatenate((first[:, nq:], solution.v)))
-    start, energies = float(energies[0].sum()), energies[1:]
+    powers = {name: one for term in TERMS for name, one in term(nodes, system).items()}
+    works = {name: work[place] for name, work in nodes.works(powers).items()}
+    start = float(first.sum())
     kinetic, potential = energies.T
-    sums = [[start], kinetic, energies.sum(axis=1)]
-    rounding = _rounding(solution.mechanism, np.concatenate(sums))
+    largest = max(abs(start), _largest(kinetic), _largest(kinetic + potential))
+    rounding = _rounding(solution.mechanism, largest)
     return EnergyBalance(solution.t, kinetic, potential, KnownKeys(works), start, rounding)
+
+
+def _largest(values: FloatArray) -> float:
+    return float(np.abs(values).max(initial=0.0))
 
 
 @per_model
@@ -316,9 +341,9 @@ def _weight(mechanism: Mechanism) -> float:
     return mass * float(np.linalg.norm(mechanism.model.gravity.linear))
 
 
-def _rounding(mechanism: Mechanism, energies: FloatArray) -> float:
-    """Rounding error (J) of sums of these energies, whose zero is where potentials cancel."""
-    largest = float(np.abs(energies).max(initial=0.0))
+def _rounding(mechanism: Mechanism, largest: float) -> float:
+    """Rounding error (J) of sums of energies up to the ``largest``, whose zero is where potentials
+    cancel."""
     return float(
         RELATIVE_ROUNDING * (_weight(mechanism) * mechanism.structure.units.length + largest)
     )

@@ -15,7 +15,7 @@ from srm_mbs.dynamics.constraints.reactions import Reactions
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.dynamics.observables import Observables
+from srm_mbs.dynamics.observables import Invariants, Observables
 from srm_mbs.dynamics.point_motion import (
     Place,
     PointMotion,
@@ -543,8 +543,21 @@ class SimulationResult(RunOutcome):
     def drift(self) -> FloatArray:
         """Closure errors (n, 2): ||g - s|| (m, rad) and ||G v - s'|| (m/s, rad/s), s the motion of
         the drives; all rows, unscaled."""
-        g, c = self.observables.closure_errors(self.t, self.q, self.v)
+        known = self.__dict__.get("invariants")
+        g, c = known[:2] if known else self.observables.closure_errors(self.t, self.q, self.v)
         return np.column_stack([np.linalg.norm(g, axis=1), np.linalg.norm(c, axis=1)])
+
+    @cached_property
+    def invariants(self) -> Invariants:
+        """Closure errors of all rows, unscaled, and energies at ``t``, which take one pass over the
+        bodies together."""
+        return self.observables.invariants(self.t, self.q, self.v)
+
+    @property
+    def energies(self) -> FloatArray:
+        """Kinetic and potential energy (n, 2) J."""
+        known = self.__dict__.get("invariants")
+        return known.energies if known else self.observables.energies(self.q, self.v)
 
     @cached_property
     def energy(self) -> FloatArray:
@@ -552,7 +565,7 @@ class SimulationResult(RunOutcome):
 
         Constant torques and wrenches have no potential here.
         """
-        energy: FloatArray = self.observables.energies(self.q, self.v).sum(axis=1)
+        energy: FloatArray = self.energies.sum(axis=1)
         return energy
 
     @cached_property

@@ -899,15 +899,21 @@ class FinishedRun:
 
     @cached_property
     def dense(self) -> DenseOutput | None:
-        if self.steps is None:
-            return None
         record, scheme = self._record, self._options.method.scheme
+        if self._summary is not None:
+            record = cast(CompiledRecord, record)
+            steps: Any = partial(record.data, scheme, self._system.tangent_size)
+            count, recorded = self._summary.steps, record.recorded()
+        elif self.steps is None:
+            return None
+        else:
+            steps, count, recorded = self.steps, self.steps.count, None
         # The dense output of a single step is that in which the event was found.
-        end_state = record.stop_state if self.steps.count == 1 else None
+        end_state = record.stop_state if count == 1 else None
         if isinstance(record, CompiledRecord):
             own, by = self._kernel_system, self.backend
-            return CompiledDenseOutput(own, self._system, scheme, self.steps, end_state, by)
-        return DenseOutput(self._system, scheme, self.steps, end_state)
+            return CompiledDenseOutput(own, self._system, scheme, steps, end_state, by, recorded)
+        return DenseOutput(self._system, scheme, steps, end_state)
 
     @cached_property
     def attempts(self) -> NDArray[np.void]:

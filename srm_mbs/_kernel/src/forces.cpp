@@ -65,32 +65,49 @@ double stretched(const ForceElement& e, double beyond) {
     return beyond - std::min(std::max(beyond, 0.0), slack(e));
 }
 
-void spring_damper(const ForceElement& e, double coincident, const pinocchio::Data& data,
-                   const Sums& sums, ForceLaws* laws, int law) {
-    const Vector3d at_a = origin(e.a, data), at_b = origin(e.b, data);
-    const Vector3d apart = at_a - at_b;
-    const double length = apart.norm();
-    if (length < coincident * e.rest) throw EvaluationError{Failure::coincident};
-    // k (l - l0) apart/l, without dividing where l = l0 = 0.
-    Vector3d force = -e.stiffness * apart;
-    if (slack(e) != 0.0)
-        force *= stretched(e, length - e.rest) / (length != 0.0 ? length : 1.0);
-    else if (e.rest != 0.0)
-        force *= 1.0 - e.rest / length;
-    if (e.damping != 0.0) {
-        const Vector3d rate = point_velocity(velocity(e.a, data), at_a) -
-                              point_velocity(velocity(e.b, data), at_b);
+// The points of a spring-damper, and its force on that of a.
+struct SpringDamper {
+    Vector3d at_a, at_b, apart, force;
+    double length;
+
+    SpringDamper(const ForceElement& e, double coincident, const pinocchio::Data& data)
+        : at_a(origin(e.a, data)),
+          at_b(origin(e.b, data)),
+          apart(at_a - at_b),
+          force(-e.stiffness * apart),
+          length(apart.norm()) {
+        if (length < coincident * e.rest) throw EvaluationError{Failure::coincident};
+        // k (l - l0) apart/l, without dividing where l = l0 = 0.
+        if (slack(e) != 0.0)
+            force *= stretched(e, length - e.rest) / (length != 0.0 ? length : 1.0);
+        else if (e.rest != 0.0)
+            force *= 1.0 - e.rest / length;
+    }
+
+    // Of the point of a against that of b.
+    Vector3d rate(const ForceElement& e, const pinocchio::Data& data) const {
+        return point_velocity(velocity(e.a, data), at_a) -
+               point_velocity(velocity(e.b, data), at_b);
+    }
+
+    void damp(const ForceElement& e, const Vector3d& rate) {
         // Points that meet move along the line that joins them.
         const Vector3d along =
             length != 0.0 ? Vector3d(apart * ((apart / length).dot(rate) / length)) : rate;
         force -= e.damping * along;
     }
+};
+
+void spring_damper(const ForceElement& e, double coincident, const pinocchio::Data& data,
+                   const Sums& sums, ForceLaws* laws, int law) {
+    SpringDamper found(e, coincident, data);
+    if (e.damping != 0.0) found.damp(e, found.rate(e, data));
     if (laws && law >= 0) {
-        const Vector3d line = apart / (length != 0.0 ? length : 1.0);
-        const double own = force.dot(line), acting = laws->acting(law, own);
-        if (acting != own) force = acting * line;
+        const Vector3d line = found.apart / (found.length != 0.0 ? found.length : 1.0);
+        const double own = found.force.dot(line), acting = laws->acting(law, own);
+        if (acting != own) found.force = acting * line;
     }
-    add_wrench(e, data, force, Vector3d::Zero(), at_a, sums);
+    add_wrench(e, data, found.force, Vector3d::Zero(), found.at_a, sums);
 }
 
 // Number k of an element whose numbers may follow laws.
@@ -434,6 +451,14 @@ void bushing_turns(const std::vector<ForceElement>& elements,
         std::copy_n(coefficient.data(), 2, out + 3);
         out += 5;
     }
+}
+
+double spring_damper_power(const ForceElement& e, double coincident,
+                           const pinocchio_model::Workspace& work) {
+    SpringDamper found(e, coincident, work.data);
+    const Vector3d rate = found.rate(e, work.data);
+    if (e.damping != 0.0) found.damp(e, rate);
+    return found.force.dot(rate);
 }
 
 double potential_energy(const std::vector<ForceElement>& elements,

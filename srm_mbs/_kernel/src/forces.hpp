@@ -150,6 +150,11 @@ void bushing_turns(const std::vector<ForceElement>& elements,
                    const pinocchio_model::Workspace& work, std::vector<BushingStep>& step,
                    double* out);
 
+// Power (W) of a spring-damper at the placements and velocities that the workspace holds.  Throws
+// EvaluationError.
+double spring_damper_power(const ForceElement& element, double coincident,
+                           const pinocchio_model::Workspace& work);
+
 // Potential energy (J) of those that have one; the workspace holds the placements.
 double potential_energy(const std::vector<ForceElement>& elements,
                         const pinocchio_model::Workspace& work, const double* q);

@@ -4,6 +4,7 @@
 #include <limits>
 #include <map>
 #include <memory>
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -25,6 +26,7 @@
 #include "linear.hpp"
 #include "manifold.hpp"
 #include "model.hpp"
+#include "processor.hpp"
 #include "run.hpp"
 #include "separated_rows.hpp"
 #include "sigma_dips.hpp"
@@ -55,6 +57,18 @@ std::vector<double> numbers(nb::handle array, int size, const char* name) {
 
 std::vector<double> optional_vector(nb::handle object) {
     return object.is_none() ? std::vector<double>{} : to_vector(object);
+}
+
+// h times the sum (n,) of the rows (count, n) with these weights (count,).
+SRM_FOR_PROCESSOR
+void weighted_sum(const double* weights, std::size_t count, double h, const double* rows,
+                  std::size_t n, double* __restrict__ out) {
+    std::fill_n(out, n, 0.0);
+    for (std::size_t j = 0; j < count; ++j, rows += n) {
+        const double weight = h * weights[j];
+        if (weight == 0.0) continue;
+        for (std::size_t k = 0; k < n; ++k) out[k] += weight * rows[k];
+    }
 }
 
 // A view of `values`, which `owner` keeps alive.
@@ -216,16 +230,23 @@ struct PySystem {
         return n;
     }
 
-    // g - s and G v - s' (n, rows).
-    nb::tuple closure_errors(const Array& t, const Array& states) {
+    // g - s and G v - s' (n, rows); with_energies: and kinetic and potential energy (n, 2).
+    nb::tuple closure_errors(const Array& t, const Array& states, bool with_energies) {
         const std::size_t n = count_of(t, states, state_size()), nx = state_size();
         const auto rows = static_cast<std::size_t>(system->rows());
-        std::vector<double> g(n * rows), rates(n * rows);
-        for (std::size_t i = 0; i < n; ++i)
-            system->closure_errors(t.data()[i], states.data() + i * nx, g.data() + i * rows,
+        std::vector<double> g(n * rows), rates(n * rows), energies(with_energies ? 2 * n : 0);
+        for (std::size_t i = 0; i < n; ++i) {
+            const double* const state = states.data() + i * nx;
+            system->closure_errors(t.data()[i], state, g.data() + i * rows,
                                    rates.data() + i * rows);
-        return nb::make_tuple(owned_array(std::move(g), {n, rows}),
-                              owned_array(std::move(rates), {n, rows}));
+            if (!with_energies) continue;
+            const auto found = system->energies(state, true);
+            std::copy(found.begin(), found.end(), energies.begin() + 2 * i);
+        }
+        const nb::object errors = owned_array(std::move(g), {n, rows});
+        const nb::object of_rates = owned_array(std::move(rates), {n, rows});
+        if (!with_energies) return nb::make_tuple(errors, of_rates);
+        return nb::make_tuple(errors, of_rates, owned_array(std::move(energies), {n, 2}));
     }
 
     // The largest |g - s| and |G v - s'| at q (nq,) and v (nv,), over the units (rows,) of the rows;
@@ -469,10 +490,7 @@ struct PySystem {
             const double h = times.data()[step + 1] - times.data()[step];
             const double* const own = rates.data() + step * width * n;
             for (std::size_t i = 0; i < stages; ++i) {
-                std::fill(moved.begin(), moved.end(), 0.0);
-                for (std::size_t j = 0; j < s; ++j)
-                    if (const double a = A.data()[i * s + j]; a != 0.0)
-                        add(h * a, own + j * n, moved.data(), static_cast<int>(n));
+                weighted_sum(A.data() + i * s, s, h, own, n, moved.data());
                 system->retract(states.data() + step * nx, moved.data(), &x[i * nx]);
                 t[i] = times.data()[step] + h * c.data()[i];
             }
@@ -603,7 +621,8 @@ void bind_system(nb::module_& m) {
              [](PySystem& s, double t, const Array& state) {
                  s.system->begin_step(t, vector_of(state, s.state_size(), "state"));
              })
-        .def("closure_errors", &PySystem::closure_errors)
+        .def("closure_errors", &PySystem::closure_errors, nb::arg("t"), nb::arg("states"),
+             nb::arg("with_energies") = false)
         .def("largest_errors", &PySystem::largest_errors, nb::arg("t"), nb::arg("q"), nb::arg("v"),
              nb::arg("unit"))
         .def("jacobians", &PySystem::jacobians)
@@ -1198,6 +1217,15 @@ void bind_run(nb::module_& m) {
                                                any(s.stiff));
                      })
         .def_prop_ro("break_count", [](const PyRecords& r) { return r.records.breaks.size(); })
+        // Whether dense output needs no more than the records: no breakpoint and no zone, and no
+        // step past a critical configuration.
+        .def_prop_ro("plain",
+                     [](const PyRecords& r) {
+                         const StepRecords& s = r.records;
+                         const auto& placed = s.placements;
+                         return s.breaks.empty() && s.zones.empty() &&
+                                std::count(placed.begin(), placed.end(), s.critical) == 0;
+                     })
         .def_prop_ro("end_rate", [](const PyRecords& r) { return owned_array(r.end_rate); })
         .def_prop_ro("zones", [](const PyRecords& r) { return r.records.zones; });
 
@@ -1255,6 +1283,34 @@ void bind_run(nb::module_& m) {
         .def_prop_ro("evaluation_failed", [](const PyRun& r) { return r.run->evaluation_failed; })
         .def_prop_ro("placed", [](const PyRun& r) { return r.run->control->placed; })
         .def_prop_ro("replaced", [](const PyRun& r) { return r.run->control->replaced; });
+}
+
+// Of the rows of x (n, 2 nv) the largest entry of either half over its unit (n, 2), and the largest
+// norm (m,) in any row of each group of entries order[starts[i]], ..., order[starts[i + 1] - 1].
+nb::tuple largest_entries(const Array& x, const Array& unit, const std::vector<int>& order,
+                          const std::vector<int>& starts) {
+    const std::size_t width = unit.size(), n = x.shape(0), groups = starts.size();
+    if (x.ndim() != 2 || x.shape(1) != width || width % 2 != 0 || order.size() != width)
+        throw nb::value_error("x, unit or order has another shape");
+    expect_within("order", order, 0, static_cast<int>(width) - 1);
+    expect_within("starts", starts, 0, static_cast<int>(width) - 1);
+    std::vector<double> size(2 * n), norms(groups);
+    const auto take = [](double value, double& largest) {  // nothing is larger than NaN
+        if (value > largest || std::isnan(value)) largest = value;
+    };
+    const double* row = x.data();
+    for (std::size_t i = 0; i < n; ++i, row += width) {
+        for (std::size_t k = 0; k < width; ++k)
+            take(std::abs(row[k] / unit.data()[k]), size[2 * i + (2 * k >= width)]);
+        for (std::size_t g = 0; g < groups; ++g) {
+            const std::size_t end = g + 1 < groups ? starts[g + 1] : width;
+            double square = 0.0;
+            for (std::size_t k = starts[g]; k < end; ++k) square += row[order[k]] * row[order[k]];
+            take(square, norms[g]);
+        }
+    }
+    for (double& norm : norms) norm = std::sqrt(norm);
+    return nb::make_tuple(owned_array(std::move(size), {n, 2}), owned_array(std::move(norms)));
 }
 
 // ---- Dense output -------------------------------------------------------------------------------
@@ -1325,8 +1381,29 @@ struct PySteps {
     }
 };
 
+// The steps of `records`, in the memory of these, of a run that ended at `end` (s): without
+// breakpoints, zones and layers.
+StepArrays arrays(const PyRecords& records, double end) {
+    const StepRecords& r = records.records;
+    StepArrays out;
+    out.count = static_cast<long>(r.ranks.size());
+    out.end = end;
+    out.width = static_cast<int>(records.stages);
+    out.corrected = records.corrected > 0;
+    out.times = r.times.data();
+    out.states = r.states.data();
+    out.rates = r.rates.data();
+    out.corrections = r.corrections.data();
+    out.sigmas = r.sigmas.data();
+    out.end_rate = records.end_rate.data();
+    out.stiff.assign(r.stiff.begin(), r.stiff.end());
+    out.in_zone.assign(r.ranks.size(), 0);
+    return out;
+}
+
 struct PyDense {
-    PySteps steps;  // kept alive
+    nb::object records;  // kept alive, as the arrays of `steps`
+    std::optional<PySteps> steps;
     DenseOutput dense;
     std::size_t nx;
 
@@ -1334,8 +1411,23 @@ struct PyDense {
             const DenseConstants& constants, const PySteps& steps_)
         : steps(steps_),
           dense(nq, nv, schemes, constants,
-                steps.arrays(nq, nv, schemes.empty() ? 0 : schemes[0].abscissae.size())),
+                steps->arrays(nq, nv, schemes.empty() ? 0 : schemes[0].abscissae.size())),
           nx(static_cast<std::size_t>(nq + nv)) {}
+
+    PyDense(const std::vector<SchemeDense>& schemes, const DenseConstants& constants,
+            nb::object records_, double end)
+        : PyDense(schemes, constants, nb::cast<const PyRecords&>(records_), end) {
+        records = std::move(records_);
+    }
+
+    PyDense(const std::vector<SchemeDense>& schemes, const DenseConstants& constants,
+            const PyRecords& from, double end)
+        : dense(static_cast<int>(from.nx - from.n / 2), static_cast<int>(from.n / 2), schemes,
+                constants, arrays(from, end)),
+          nx(from.nx) {
+        const std::size_t stages = schemes[0].abscissae.size();
+        if (stages != from.stages) throw nb::value_error("the records have another number of stages");
+    }
 
     nb::object states(PySystem& owner, const Array& t) {
         const std::size_t k = t.size();
@@ -1371,11 +1463,14 @@ nb::object py_recorded_dips(const DipSearch& search, const Array& times, const A
 void bind_dense_output(nb::module_& m) {
     m.def("recorded_dips", &py_recorded_dips);
     bind_struct<PySteps>(m, "StepArrays");
+    m.def("largest_entries", &largest_entries);
     nb::class_<PyDense>(m, "DenseOutput")
         .def(nb::init<int, int, const std::vector<SchemeDense>&, const DenseConstants&,
                       const PySteps&>(),
              nb::arg("nq"), nb::arg("nv"), nb::arg("schemes"), nb::arg("constants"),
              nb::arg("steps"))
+        .def(nb::init<const std::vector<SchemeDense>&, const DenseConstants&, nb::object, double>(),
+             nb::arg("schemes"), nb::arg("constants"), nb::arg("records"), nb::arg("end"))
         .def("states", &PyDense::states)
         .def("between_ends", &PyDense::between_ends);
 }

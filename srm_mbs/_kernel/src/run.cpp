@@ -388,13 +388,12 @@ void Run::prepare(const std::vector<PassagePoint>& points) {
 
 // Makes the next of the prepared steps.
 Stop Run::make_prepared() {
-    constexpr int critical = 3;  // STEP_PLACEMENTS of dense_output.py
     made_by_ = &step;
     step.result = std::move(prepared_.back().first);
     const double t = prepared_.back().second;
     prepared_.pop_back();
     h_ = step.result.h;
-    record(step.result, t, critical);
+    record(step.result, t, StepRecords::critical);
     if (prepared_.empty()) {
         known_ = quiet_ = false;
         examine_below_ = inf;

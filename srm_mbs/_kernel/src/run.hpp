@@ -76,12 +76,14 @@ struct ZoneRecord {
 // The accepted steps, one after the other.
 struct StepRecords {
     std::vector<double> times, states, rates, corrections, sigmas, ranks, error_ratios;
-    std::vector<double> placements;  // 0: none, 1: placed, 2: redone
+    std::vector<double> placements;  // 0: none, 1: placed, 2: redone, critical
     std::vector<double> stiff;       // 1: the problem had been found to be stiff
     std::vector<double> held;        // 1: a stage kept the normals of the last node
     std::vector<double> breaks;      // numbers of the steps before breakpoints
     std::vector<double> break_rates; // (breaks, n), tangent rates there
     std::vector<ZoneRecord> zones;
+
+    static constexpr int critical = 3;  // STEP_PLACEMENTS of dense_output.py
 
     long count() const { return static_cast<long>(times.size()); }
     void append(const StepResult& result, double t_new, int placement);

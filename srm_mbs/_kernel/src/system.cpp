@@ -1492,9 +1492,9 @@ void System::closure_errors(double t, const double* state, double* g, double* ra
     std::copy(g_.begin(), g_.end(), g);
 }
 
-std::array<double, 2> System::energies(const double* state) {
+std::array<double, 2> System::energies(const double* state, bool there) {
     auto& w = *work_;
-    move_bodies(state);
+    if (!there) move_bodies(state);
     double kinetic = 0.0, potential = potential_energy(data_.forces, w, state);
     for (int i = 1; i < w.model.njoints; ++i) {
         const auto& body = w.model.inertias[i];
@@ -1540,6 +1540,10 @@ void System::powers(const double* t, const double* states, std::size_t n,
         if (bodies && resting) pinocchio::computeJointJacobians(w.model, w.data);
         for (const std::vector<ForceElement>& one : each) {
             const ForceElement& e = one.front();
+            if (!resting && e.kind == ForceKind::spring_damper) {
+                *out++ = spring_damper_power(e, data_.coincident, w);
+                continue;
+            }
             const bool by_wrenches = !resting && on_bodies(e);
             if (by_wrenches)
                 for (const int joint : {e.a.joint, e.b.joint})

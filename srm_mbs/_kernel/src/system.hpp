@@ -242,8 +242,9 @@ public:
     // With all terms of other states lost: of one state g - s and G v - s' (rows,), and the kinetic
     // and the potential energy, of gravity and of springs; of n states the powers (n, forces) of
     // `each` element at the rates of the state or, if it is `resting`, those of its force at rest.
+    // there: whether the bodies are at this state already, from closure_errors().
     void closure_errors(double t, const double* state, double* g, double* rates);
-    std::array<double, 2> energies(const double* state);
+    std::array<double, 2> energies(const double* state, bool there = false);
     void powers(const double* t, const double* states, std::size_t n,
                 const SeparateElements& each, bool resting, double* out);
     SeparateElements separate(const std::vector<ForceElement>& elements) const;

@@ -16,6 +16,7 @@ from srm_mbs.analysis.accuracy.assessment import (
 )
 from srm_mbs.analysis.accuracy.conservation import Drift, EnergyError, drift_of, energy_error
 from srm_mbs.analysis.accuracy.error_estimate import ErrorEstimate, checked_settings, estimate_error
+from srm_mbs.analysis.accuracy.samples import at_ends, sampled
 from srm_mbs.model.numbers import flag
 from srm_mbs.simulation.rerun import unsupported_reason
 from srm_mbs.simulation.result import SimulationResult, check_run
@@ -114,11 +115,13 @@ def certify(
     """
     check_run(solution)
     settings = checked_settings(solution, rtol)
-    drift, energy = drift_of(solution), energy_error(solution)
+    samples = [sampled(part) for part in solution.segments]
+    drift = drift_of(samples)
+    energy = energy_error(at_ends(solution) if len(samples) > 1 else samples[0].run)
     reason = unsupported_reason(solution) if flag(again, "again") else "it was not asked for"
-    if not reason and not solution.steps.count:
+    if not reason and not solution.stats.steps:
         reason = "the run took no step"
-    estimate = reason or estimate_error(solution, settings, progress)
+    estimate = reason or estimate_error(solution, settings, samples, progress)
     return Certificate(
         solution.mechanism.name,
         (

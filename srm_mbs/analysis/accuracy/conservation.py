@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from srm_mbs.analysis.accuracy.error_estimate import even_times
+from srm_mbs._typing import BoolArray, FloatArray
+from srm_mbs.analysis.accuracy.samples import Samples
+from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import constraint_angles
 from srm_mbs.errors import EvaluationError, InputError
+from srm_mbs.model.mechanism import per_model
 from srm_mbs.simulation.result import SimulationResult
 
 
@@ -61,29 +66,41 @@ class EnergyError:
     rounding: float
 
 
-def drift_of(solution: SimulationResult) -> tuple[Drift, ...]:
-    """The drift of a run, for each unit of its closure rows and drives; empty for an open chain."""
+@per_model
+def _rows_by_unit(mechanism: Mechanism) -> list[tuple[str, BoolArray | slice, float]]:
+    """Unit, rows and scale of the closure rows and drives of each unit."""
+    angles = constraint_angles(mechanism)
+    units = ("m", ~angles, mechanism.structure.units.length), ("rad", angles, 1.0)
+    return [
+        (unit, slice(None) if own.all() else own, scale) for unit, own, scale in units if own.any()
+    ]
+
+
+def _largest_norm(errors: FloatArray) -> float:
+    """Of the rows of ``errors`` (n, k)."""
+    return math.sqrt(np.maximum.reduce(np.add.reduce(errors * errors, axis=1)))
+
+
+def drift_of(samples: Sequence[Samples]) -> tuple[Drift, ...]:
+    """The drift of a run, for each unit of its closure rows and drives; empty for an open chain.
+
+    Parameters
+    ----------
+    samples
+        Of each of its segments.
+    """
     found: dict[str, list[list[float]]] = {}
-    for part in solution.segments:
-        mechanism = part.mechanism
-        if not mechanism.constrained:
+    for part in samples:
+        run, nq = part.run, part.run.mechanism.model.nq
+        if not run.mechanism.constrained:
             continue
-        ends = part.steps.times
-        if part.steps.stop is not None:  # an event within the last step
-            ends = ends[:-1]
-        count = len(ends)
-        t, nq = np.concatenate((ends, even_times(part))), mechanism.model.nq
-        states = part.states(t)
-        errors = part.observables.closure_errors(t, states[:, :nq], states[:, nq:])
-        squares = [e * e for e in errors]
-        angles = constraint_angles(mechanism)
-        length = mechanism.structure.units.length
-        for unit, own, scale in (("m", ~angles, length), ("rad", angles, 1.0)):
-            if own.any():
-                sums = [square @ own for square in squares]
-                largest = [float(np.sqrt(each[:count].max())) for each in sums]
-                between = [float(np.sqrt(each.max())) for each in sums]
-                found.setdefault(unit, []).append([*largest, *between, scale])
+        ends = [errors[: len(part.ends)] for errors in run.invariants[:2]]
+        q, v = part.even_states[:, :nq], part.even_states[:, nq:]
+        between = run.observables.closure_errors(part.even, q, v)
+        for unit, own, scale in _rows_by_unit(run.mechanism):
+            largest = [_largest_norm(errors[:, own]) for errors in ends]
+            more = [_largest_norm(errors[:, own]) for errors in between]
+            found.setdefault(unit, []).append([*largest, *np.maximum(largest, more), scale])
     worst = {unit: np.max(parts, axis=0).tolist() for unit, parts in found.items()}
     return tuple(
         Drift(unit, *(*largest, largest[0] / scale)) for unit, (*largest, scale) in worst.items()
@@ -91,15 +108,21 @@ def drift_of(solution: SimulationResult) -> tuple[Drift, ...]:
 
 
 def energy_error(solution: SimulationResult) -> EnergyError | str:
-    """Residual of the energy balance, or the reason why it cannot be computed."""
-    if solution.t_eval is not None:  # few times, or none, do not represent the run
-        ends = [[*part.steps.times[:-1], part.steps.end] for part in solution.segments]
-        solution = solution.at(np.unique(np.concatenate(ends)))
+    """Residual of the energy balance, or the reason why it cannot be computed.
+
+    Parameters
+    ----------
+    solution
+        The run at the ends of its steps (:func:`~srm_mbs.analysis.accuracy.samples.at_ends`).
+    """
     try:
         balance = solution.energy_balance
     except (InputError, EvaluationError) as error:
         return str(error)
-    residual = float(np.abs(balance.residual).max(initial=0.0))
     return EnergyError(
-        residual, balance.scale, balance.relative, tuple(balance.works), balance.rounding
+        balance.largest_residual,
+        balance.scale,
+        balance.relative,
+        tuple(balance.works),
+        balance.rounding,
     )

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs._typing import BoolArray, FloatArray, IndexArray
+from srm_mbs._typing import BoolArray, FloatArray
+from srm_mbs.analysis.accuracy.samples import Samples, sample_states, sample_times
 from srm_mbs.dynamics.scaling import angle_coordinates
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.psrm import PSRM
@@ -23,12 +24,6 @@ from srm_mbs.simulation.options import positive, tightest_rtol
 from srm_mbs.simulation.rerun import rerun
 from srm_mbs.simulation.result import SimulationResult
 
-MAX_STEP_ENDS = 2000
-"""Most ends of steps at which two runs are compared."""
-EVEN_TIMES = 501
-"""Number of evenly spaced times at which they are compared as well, by dense output."""
-FEWEST_EVEN_TIMES = 25
-"""Fewest of them where each costs further stages; up to a fifth of the steps is read then."""
 READING_ERROR = 2e-3
 """Largest error of reading a rerun between its steps, over the tolerance of the one before it."""
 READING_MARGIN = 5.0
@@ -111,8 +106,8 @@ class Sizes:
 
     def until(self, limit: float) -> float | None:
         """The first time (s) at which ``size`` exceeds ``limit``; None if never."""
-        beyond = np.flatnonzero((self.size > limit).any(axis=1))
-        return float(self.t[beyond[0]]) if len(beyond) else None
+        beyond = self.size > limit
+        return float(self.t[beyond.any(axis=1).argmax()]) if beyond.any() else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,9 +235,18 @@ def checked_settings(solution: SimulationResult, rtol: float | None) -> list[flo
 
 
 def estimate_error(
-    solution: SimulationResult, settings: list[float], progress: Any = False
+    solution: SimulationResult,
+    settings: list[float],
+    samples: Sequence[Samples],
+    progress: Any = False,
 ) -> ErrorEstimate | str:
-    """Repeat ``solution`` at each of ``settings``, and compare; or the reason why that failed."""
+    """Repeat ``solution`` at each of ``settings``, and compare; or the reason why that failed.
+
+    Parameters
+    ----------
+    samples
+        Of each segment of ``solution``.
+    """
     fixed = solution.settings.step is not None
     name = "step" if fixed else "rtol"
     runs = [(float(solution.settings.step or solution.settings.rtol), solution)]
@@ -252,19 +256,19 @@ def estimate_error(
             again = rerun(solution, **options, progress=progress)
         except InputError as error:
             return f"the run at {name} = {setting:.3g} was refused: {error}"
-        if not again.steps.count:
+        if not again.stats.steps:
             return f"the run at {name} = {setting:.3g} did not start: {again.message}"
         runs.append((setting, again))
     runs.sort(key=lambda pair: pair[0], reverse=True)
     tightest = runs[-1][1]
     bound = tightest is solution
     partner = runs[-2][1] if bound else tightest
-    times = sample_times(solution)
+    known = times, _ = sample_states(solution, samples)
     # A scheme has its order at the ends of steps only; the coarsest grid is a subset of the others.
     whole_grid = sample_times(runs[0][1], fixed=True) if fixed else times
     errors = [] if fixed else [READING_ERROR * min(setting for setting, _ in runs[:-1])]
     for reading_error in (*errors, None):
-        readings = Readings(solution, reading_error)
+        readings = Readings(solution, reading_error, known)
         kept = whole = compare(solution, partner, times, readings)
         grid, apart = whole_grid, whole.until(DISAGREEMENT)
         if apart is not None:
@@ -364,30 +368,6 @@ def parted_at(whole: Comparison, run: SimulationResult, other: SimulationResult)
 # Comparison of two runs ----------------------------------------------------------------------
 
 
-def sample_times(solution: SimulationResult, *, fixed: bool = False) -> FloatArray:
-    """Times (n,) s at which a run is compared: ends of its steps, and evenly spaced ones.
-
-    With ``fixed`` the ends only, at which the method has its order.
-    """
-    start, end = solution.span
-    ends = solution.steps.times
-    ends = ends[(ends >= start) & (ends <= end)]
-    if len(ends) > MAX_STEP_ENDS:
-        ends = ends[np.unique(np.linspace(0, len(ends) - 1, MAX_STEP_ENDS).astype(int))]
-    if fixed:
-        return np.union1d(ends, [end])
-    return np.union1d(ends, even_times(solution))
-
-
-def even_times(solution: SimulationResult) -> FloatArray:
-    """Evenly spaced times (s) from start to end: EVEN_TIMES, or fewer where dense output takes
-    further stages in each step that it is read in."""
-    count = EVEN_TIMES
-    if len(solution.scheme.dense.extra_c):
-        count = min(count, max(FEWEST_EVEN_TIMES, solution.steps.count // 5))
-    return np.linspace(*solution.span, count)
-
-
 class Readings:
     """Runs read at times of comparison: ``solution`` by its dense output, and its reruns within a
     part of the tolerance, each once.
@@ -398,13 +378,22 @@ class Readings:
         The run whose error is estimated.
     allowed
         Largest error of reading a rerun, in units; None to read all by dense output.
+    known
+        Times (n,) s and the states (n, nq + nv) of ``solution`` there.
     """
 
-    def __init__(self, solution: SimulationResult, allowed: float | None = None) -> None:
+    def __init__(
+        self,
+        solution: SimulationResult,
+        allowed: float | None = None,
+        known: tuple[FloatArray, FloatArray] | None = None,
+    ) -> None:
         self._solution = solution
         unit = solution.mechanism.structure.units.state
         self._allowed = None if allowed is None else allowed * unit
         self._known: dict[tuple[int, bytes], FloatArray] = {}
+        if known is not None:
+            self._known[id(solution), known[0].tobytes()] = known[1]
 
     def __call__(self, run: SimulationResult, times: FloatArray) -> FloatArray:
         """States (n, nq + nv) at the ``times`` (n,) s."""
@@ -426,8 +415,9 @@ class Differences(Sizes):
         As in :class:`Sizes`.
     jumps
         As in :class:`Comparison`.
-    apart, rates : (n, nv)
-        Motions from one to the other, and changes of the rates.
+    norms : (2 k,)
+        The largest norm at any time of the motion from one to the other of each of k parts of the
+        joints (:class:`Parts`), and of the change of its rates.
     states : (n, nq + nv)
         Those of the first one.
     run
@@ -435,27 +425,24 @@ class Differences(Sizes):
     """
 
     jumps: FloatArray
-    apart: FloatArray
-    rates: FloatArray
+    norms: FloatArray
     states: FloatArray
     run: SimulationResult
 
     def comparison(self) -> Comparison:
         """With the largest difference of each joint."""
         mechanism, run, states = self.run.mechanism, self.run, self.states
-        model = mechanism.model
-        start = np.repeat(states[:1], len(states), axis=0)
-        moved = run.segments[0].observables.differences(start, states)[:, : model.nv]
+        model, observables = mechanism.model, run.segments[0].observables
+        moved = observables.differences(np.repeat(states[:1], len(states), axis=0), states)
+        moved[:, model.nv :] = states[:, model.nq :]
         for name, k in _turning_joints(mechanism):
             angle = run.unwrapped(name, self.t, states)
             moved[:, k] = angle - angle[:1]
         parts = _parts(mechanism)
-        # The norm over the coordinates of each part, at the time at which it is largest.
-        changes = (self.apart, self.rates, moved, states[:, model.nq :])
-        largest = [parts.largest_norms(x) for x in changes]
-        joints = tuple(
-            JointDifference(*own, *numbers) for own, *numbers in zip(parts.names, *largest)
-        )
+        units = mechanism.structure.units.state
+        _, norms = observables.largest_entries(moved, units, parts.order, parts.starts)
+        numbers = np.concatenate((self.norms, norms)).reshape(4, -1).T.tolist()
+        joints = tuple(JointDifference(*own, *each) for own, each in zip(parts.names, numbers))
         return Comparison(self.t, self.size, joints, self.jumps)
 
 
@@ -471,17 +458,14 @@ def compare(
     if len(run.segments) > 1 or len(other.segments) > 1:
         allowed, jumps = _between_jumps(run, other, times)
         times = times[allowed]
-    mechanism, nv = run.mechanism, run.mechanism.model.nv
+    mechanism, observables = run.mechanism, run.segments[0].observables
     a, b = read(run, times), read(other, times)
-    both = run.segments[0].observables.differences(a, b)
-    apart, rates = both[:, :nv], both[:, nv:]
+    apart = observables.differences(a, b)
     for name, k in _turning_joints(mechanism):
         apart[:, k] = other.unwrapped(name, times, b) - run.unwrapped(name, times, a)
-    parts = np.abs(both / mechanism.structure.units.state)
-    size = np.empty((len(times), 2))
-    np.maximum.reduce(parts[:, :nv], axis=1, initial=0.0, out=size[:, 0])
-    np.maximum.reduce(parts[:, nv:], axis=1, initial=0.0, out=size[:, 1])
-    return Differences(times, size, jumps, apart, rates, a, run)
+    parts, units = _parts(mechanism), mechanism.structure.units.state
+    size, norms = observables.largest_entries(apart, units, parts.order, parts.starts)
+    return Differences(times, size, jumps, norms, a, run)
 
 
 @dataclass(frozen=True, eq=False)
@@ -492,25 +476,15 @@ class Parts:
     ----------
     names
         Joint and unit of each part.
-    order : (nv,)
-        Velocity indices of their coordinates, one part after the other.
+    order : (2 nv,)
+        Indices of their coordinates, one part after the other, and those of their rates.
     starts
-        Where they begin in ``order``; None if each has one coordinate.
+        Where the coordinates and the rates of each begin in ``order``.
     """
 
     names: list[tuple[str, str]]
-    order: IndexArray
-    starts: IndexArray | None
-
-    def largest_norms(self, x: FloatArray) -> list[float]:
-        """Of the coordinates of each part in the rows of x (n, nv) the largest norm in any row."""
-        if self.starts is None:
-            largest = np.abs(x).max(axis=0, initial=0.0)[self.order]
-        else:
-            squares = np.add.reduceat(x[:, self.order] ** 2, self.starts, axis=1)
-            largest = np.sqrt(squares.max(axis=0, initial=0.0))
-        found: list[float] = largest.tolist()
-        return found
+    order: list[int]
+    starts: list[int]
 
 
 @per_model
@@ -532,9 +506,9 @@ def _parts(mechanism: MechanismData) -> Parts:
             if len(chosen):
                 names.append((name, unit))
                 indices.append(chosen)
+    indices += [mechanism.model.nv + own for own in indices]
     starts = np.cumsum([0, *(len(own) for own in indices[:-1])])
-    order = np.concatenate(indices)
-    return Parts(names, order, None if len(order) == len(names) else starts)
+    return Parts(names, np.concatenate(indices).tolist(), starts.tolist())
 
 
 def _jump_times(run: SimulationResult) -> Sequence[float]:

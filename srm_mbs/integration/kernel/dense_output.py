@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -51,6 +52,9 @@ class CompiledDenseOutput(DenseOutput):
         As for :class:`~srm_mbs.integration.dense_output.DenseOutput`.
     made_by
         Backend of the run.
+    recorded
+        Records of the kernel and the end (s) of the run, if they are all that is needed: the
+        steps, as arrays of Python, are then not read.
     """
 
     def __init__(
@@ -58,12 +62,14 @@ class CompiledDenseOutput(DenseOutput):
         kernel_system: Any,
         system: ClosedSystem | OpenSystem,
         scheme: ButcherTableau,
-        steps: StepData,
+        steps: StepData | Callable[[], StepData],
         end_state: FloatArray | None = None,
         made_by: str = "kernel",
+        recorded: tuple[Any, float] | None = None,
     ) -> None:
         super().__init__(system, scheme, steps, end_state)
         self._made_by = made_by
+        self._recorded = recorded
         self._mechanism_system = system
         self.kernel_system = kernel_system
 
@@ -121,6 +127,8 @@ class CompiledDenseOutput(DenseOutput):
     @cached_property
     def _by_reference(self) -> bool:
         """Whether only the reference can evaluate it."""
+        if self._recorded is not None:
+            return False
         steps, extension = self._steps, self._scheme.dense
         if not steps.count:
             return True
@@ -135,14 +143,12 @@ class CompiledDenseOutput(DenseOutput):
 
     @cached_property
     def _compiled(self) -> Any:
-        system = self._mechanism_system
-        return core.DenseOutput(  # type: ignore[union-attr]
-            system.nq,
-            system.nv,
-            marshalling.scheme_denses(self._scheme),
-            marshalling.dense_constants(),
-            marshalling.steps_struct(self._steps),
-        )
+        system, schemes = self._mechanism_system, marshalling.scheme_denses(self._scheme)
+        constants = marshalling.dense_constants()
+        if self._recorded is not None:
+            return core.DenseOutput(schemes, constants, *self._recorded)  # type: ignore[union-attr]
+        steps = marshalling.steps_struct(self._steps)
+        return core.DenseOutput(system.nq, system.nv, schemes, constants, steps)  # type: ignore[union-attr]
 
 
 @lru_cache(maxsize=64)

@@ -66,6 +66,8 @@ class CompiledRecord(RunRecord):
     _suspects: Sequence[float] = ()
     _records: Any = None
     """The steps, once the run is closed."""
+    _data: StepData | None = None
+    """The same as arrays, once they were read."""
 
     def suspect_times(self) -> list[float]:
         """Ends (s) of steps that were accepted although they may have changed the branch."""
@@ -107,9 +109,20 @@ class CompiledRecord(RunRecord):
         return None if self._records is None else StepSummary(*self._records.summary)
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
-        """The accepted steps as arrays."""
-        records = self._records if self.run is None else self._take_records()
-        return steps_from(records, self.stop)
+        """The accepted steps as arrays; after :meth:`close` the same at every call."""
+        if self.run is not None:
+            return steps_from(self._take_records(), self.stop)
+        if self._data is None:
+            self._data = steps_from(self._records, self.stop)
+        return self._data
+
+    def recorded(self) -> tuple[Any, float] | None:
+        """Records and end (s) of the run, after :meth:`close`, if dense output needs no more."""
+        records = self._records
+        times = records.times
+        if len(times) < 2 or not records.plain:
+            return None
+        return records, float(times[-1]) if self.stop is None else self.stop
 
 
 def integrate(

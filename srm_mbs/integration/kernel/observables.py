@@ -18,6 +18,7 @@ from srm_mbs.dynamics.forces import ForceKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.observables import (
+    Invariants,
     Observables,
     conservative_elements,
     working_elements,
@@ -148,6 +149,14 @@ class CompiledObservables(Observables):
         except ArithmeticError:
             return super().closure_errors(t, q, v)
 
+    def invariants(self, t: FloatArray, q: FloatArray, v: FloatArray) -> Invariants:
+        """As the reference, with one pass over the bodies."""
+        try:
+            with self._all_rows() as kernel_system:
+                return Invariants(*kernel_system.closure_errors(*_states(t, q, v), True))
+        except ArithmeticError:
+            return super().invariants(t, q, v)
+
     def jacobians(self, t: FloatArray, q: FloatArray) -> FloatArray:
         times, places = np.ascontiguousarray(t, dtype=float), np.ascontiguousarray(q)
         try:
@@ -195,6 +204,13 @@ class CompiledObservables(Observables):
             return states + motions
         with self._all_rows() as kernel_system:
             return kernel_system.moved(states, motions)  # type: ignore[no-any-return]
+
+    @staticmethod
+    def largest_entries(
+        x: FloatArray, unit: FloatArray, order: list[int], starts: list[int]
+    ) -> tuple[FloatArray, FloatArray]:
+        """As the reference."""
+        return core.largest_entries(x, unit, order, starts)  # type: ignore[no-any-return,union-attr]
 
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         with self._all_rows() as kernel_system:

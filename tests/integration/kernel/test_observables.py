@@ -87,6 +87,8 @@ def test_closures_and_energies_of_many_states_are_those_of_the_reference(name: s
         same(found, expected)
     same(compiled.jacobians(t, q), reference.jacobians(t, q))
     same(compiled.energies(q, v), reference.energies(q, v))
+    for found, expected in zip(compiled.invariants(t, q, v), reference.invariants(t, q, v)):
+        same(found, expected)
 
 
 def test_rows_of_drives_have_the_rate_of_their_motion() -> None:
@@ -112,6 +114,14 @@ def test_motions_between_many_states_are_those_of_the_reference() -> None:
         there = np.roll(here, 1, axis=0)
         found, expected = (own.differences(here, there) for own in (kernel_ones, reference))
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+        width = found.shape[1]
+        order, starts = list(range(width - 1, -1, -1)), [0, 1, width // 2]
+        for x in (found, np.where(np.arange(width) == 1, np.nan, found)):
+            numbers = x, np.linspace(0.5, 3.0, width), order, starts
+            for one, other in zip(
+                kernel_ones.largest_entries(*numbers), reference.largest_entries(*numbers)
+            ):
+                np.testing.assert_allclose(one, other, rtol=1e-12)
 
 
 def test_closures_on_lie_groups_are_those_of_the_reference() -> None:
@@ -125,6 +135,8 @@ def test_closures_on_lie_groups_are_those_of_the_reference() -> None:
         same(found, expected)
     same(compiled.jacobians(t, q), reference.jacobians(t, q))
     same(compiled.energies(q, v), reference.energies(q, v))
+    for found, expected in zip(compiled.invariants(t, q, v), reference.invariants(t, q, v)):
+        same(found, expected)
 
 
 def test_powers_at_stages_are_those_of_the_states_there() -> None:

@@ -120,8 +120,8 @@ typedef long long flags __attribute__((vector_size(8 * LANES)));
 enum { WIDE = (ROWS + LANES - 1) / LANES, HIGH = (N + LANES - 1) / LANES, SHORT = @SHORT@ };
 #define EACH(b, count) _Pragma("GCC unroll 16") for (int b = 0; b < count; ++b)
 #define UNROLL(i, first, count) _Pragma("GCC unroll 8") for (int i = first; i < count; ++i)
-/* k = 0, 1, ... and backwards, and the columns of U in its row k: loops that vanish if they are
- * unrolled. */
+/* k = 0, 1, ... and backwards, and the columns of U in its row k, backwards: loops that vanish if
+ * they are unrolled. */
 #define ALWAYS_INLINE inline __attribute__((always_inline))
 #define UP(k, count) _Pragma(UNROLLED) for (int k = 0; k < (count); ++k)
 #define DOWN(k, count) _Pragma(UNROLLED) for (int k = (count) - 1; k >= 0; --k)
@@ -301,11 +301,12 @@ _SPARSE = """\
 _LOOPS = """\
 #define UNROLLED "GCC unroll 1"
 #define LATER(i, k) \\
-    for (int n_ = starts[k], i; n_ < starts[k + 1] && (i = later[n_], 1); ++n_)"""
+    for (int n_ = starts[k + 1], i; n_ > starts[k] && (i = later[n_ - 1], 1); --n_)"""
 
 _UNROLLED_LOOPS = """\
 #define UNROLLED "GCC unroll 8"
-#define LATER(i, k) UNROLL(i, k + 1, N) if (reach[k] >> i & 1)"""
+#define LATER(i, k) \\
+    _Pragma("GCC unroll 8") for (int i = N - 1; i > k; --i) if (reach[k] >> i & 1)"""
 
 _UNROLLED_TIMES_Q = """\
 /* x = Q x: reflection k leaves the numbers before the k-th, and its own entry there is 1.  Two at
@@ -483,7 +484,8 @@ static inline void reflect(const Factors *w, int k, double *restrict x) {
   EACH(b, HIGH) ((vec *)x)[b] -= s * w->V[k][b];
 }
 
-static inline void solve_pivot(const Factors *w, int k, vec *restrict left, double *restrict x) {
+static ALWAYS_INLINE void solve_pivot(const Factors *w, int k, vec *restrict left,
+                                      double *restrict x) {
   const int row = w->pivot_row[k];
   const double y = x[row] = AT(left, w->order[k]) * w->inverse_pivot[k];
   EACH(b, WIDE) left[b] -= y * w->X[row][b];
@@ -574,9 +576,10 @@ void srm_mbs_unwhiten(const void *work, double *restrict x) {
   double t[N];
   DOWN(k, N) {
     const double *const u = (const double *)w->U[k];
-    double sum = x[k];
-    LATER(i, k) sum -= u[i] * t[i];
-    t[k] = sum * w->inverse[k];
+    const double by = w->inverse[k];
+    double sum = by * x[k];
+    LATER(i, k) sum -= (by * u[i]) * t[i];  /* what was known last comes last */
+    t[k] = sum;
   }
   for (int k = 0; k < N; ++k) x[N - 1 - k] = t[k];
 }

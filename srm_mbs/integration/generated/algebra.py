@@ -120,8 +120,8 @@ typedef long long flags __attribute__((vector_size(8 * LANES)));
 enum { WIDE = (ROWS + LANES - 1) / LANES, HIGH = (N + LANES - 1) / LANES, SHORT = @SHORT@ };
 #define EACH(b, count) _Pragma("GCC unroll 16") for (int b = 0; b < count; ++b)
 #define UNROLL(i, first, count) _Pragma("GCC unroll 8") for (int i = first; i < count; ++i)
-/* k = 0, 1, ... and backwards, and the columns of U in its row k: loops that vanish if they are
- * unrolled. */
+/* k = 0, 1, ... and backwards, and the columns of U in its row k, backwards: loops that vanish if
+ * they are unrolled. */
 #define ALWAYS_INLINE inline __attribute__((always_inline))
 #define UP(k, count) _Pragma(UNROLLED) for (int k = 0; k < (count); ++k)
 #define DOWN(k, count) _Pragma(UNROLLED) for (int k = (count) - 1; k >= 0; --k)
@@ -161,6 +161,15 @@ static inline void take_row(Factors *w, const double *G, int row) {
   AT_ROWS(w)[row] = (long long)bits;
 }
 
+/* The squared norm of a column in the rows that are left. */
+static __attribute__((noinline, cold)) double square_of(const Factors *w, int column,
+                                                        uint64_t active) {
+  double sum = 0.0;
+  for IN(i, (uint64_t)AT_ROWS(w)[column] & active)
+    sum += AT(w->X[i], column) * AT(w->X[i], column);
+  return sum;
+}
+
 /* The column of the largest norm in the rows that are left, which is the next in `order`. */
 static ALWAYS_INLINE int next_column(Factors *w, int k, vec *squares, vec *limits,
                                      uint64_t active) {
@@ -169,10 +178,8 @@ static ALWAYS_INLINE int next_column(Factors *w, int k, vec *squares, vec *limit
   for (int n = k; n < ROWS; ++n) {
     const int j = w->order[n];
     if (square[j] < limit[j]) {
-      double sum = 0.0;
-      for IN(i, (uint64_t)AT_ROWS(w)[j] & active) sum += AT(w->X[i], j) * AT(w->X[i], j);
-      square[j] = sum;
-      limit[j] = RESOLVED * sum;
+      square[j] = square_of(w, j, active);
+      limit[j] = RESOLVED * square[j];
     }
     if (square[j] > most) most = square[j], best = n;
   }
@@ -294,24 +301,49 @@ _SPARSE = """\
 _LOOPS = """\
 #define UNROLLED "GCC unroll 1"
 #define LATER(i, k) \\
-    for (int n_ = starts[k], i; n_ < starts[k + 1] && (i = later[n_], 1); ++n_)
-#define PIVOT_ROW(w, k) (w)->pivot_row[k]"""
+    for (int n_ = starts[k + 1], i; n_ > starts[k] && (i = later[n_ - 1], 1); --n_)"""
 
 _UNROLLED_LOOPS = """\
 #define UNROLLED "GCC unroll 8"
-#define LATER(i, k) UNROLL(i, k + 1, N) if (reach[k] >> i & 1)
-#define PIVOT_ROW(w, k) (k)"""
+#define LATER(i, k) \\
+    _Pragma("GCC unroll 8") for (int i = N - 1; i > k; --i) if (reach[k] >> i & 1)"""
 
 _UNROLLED_TIMES_Q = """\
-/* x = Q x: reflection k leaves the numbers before the k-th, and its own entry there is 1. */
+/* x = Q x: reflection k leaves the numbers before the k-th, and its own entry there is 1.  Two at
+ * a time, whose products with x do not wait for each other. */
 static ALWAYS_INLINE void times_q(const Factors *w, double *restrict x) {
-  DOWN(k, RANK) {
-    const double *const v = (const double *)w->V[k];
-    double s = x[k];
-    UNROLL(i, k + 1, N) s += v[i] * x[i];
-    s *= w->tau[k];
-    x[k] -= s;
-    UNROLL(i, k + 1, N) x[i] -= s * v[i];
+  DOWN(n, (RANK + 1) / 2) {
+    const int k = 2 * n, next = 2 * n + 1;
+    const double *const c = (const double *)w->V[k];
+    double second[2] = {0.0, 0.0};
+    if (next < RANK) {
+      const double *const a = (const double *)w->V[next];
+      double first[2] = {0.0, 0.0}, both[2] = {0.0, 0.0};
+      UNROLL(i, next, N) {
+        first[i & 1] += a[i] * x[i];
+        second[i & 1] += c[i] * x[i];
+        both[i & 1] += a[i] * c[i];
+      }
+      const double s = w->tau[next] * (first[0] + first[1]);
+      const double t = w->tau[k] * ((x[k] + (second[0] + second[1])) - s * (both[0] + both[1]));
+      x[k] -= t;
+      UNROLL(i, next, N) x[i] -= s * a[i] + t * c[i];
+    } else {
+      UNROLL(i, k + 1, N) second[i & 1] += c[i] * x[i];
+      const double t = w->tau[k] * (x[k] + (second[0] + second[1]));
+      x[k] -= t;
+      UNROLL(i, k + 1, N) x[i] -= t * c[i];
+    }
+  }
+}
+
+/* x = R^-T Pi^T g: what the last number changes comes last. */
+static ALWAYS_INLINE void solve_pivots(const Factors *w, const double *g, double *restrict x) {
+  UP(k, RANK) {
+    const int column = w->order[k];
+    double y = g[column];
+    UNROLL(m, 0, k) y -= x[m] * AT(w->X[m], column);
+    x[k] = y * w->inverse_pivot[k];
   }
 }"""
 
@@ -338,6 +370,12 @@ static ALWAYS_INLINE void times_q(const Factors *w, double *restrict white) {
     EACH(b, HIGH) x[b] -= s * a[b] + t * c[b];
   }
   if (RANK & 1) reflect(w, 0, white);
+}
+
+static ALWAYS_INLINE void solve_pivots(const Factors *w, const double *g, double *restrict x) {
+  vec left[WIDE] = {{0}};
+  memcpy(left, g, ROWS * sizeof *g);
+  for (int k = 0; k < RANK; ++k) solve_pivot(w, k, left, x);
 }"""
 
 _UNROLLED = """\
@@ -373,14 +411,15 @@ _UNROLLED = """\
   EACH(b, WIDE) w->rows[b] = ~(flags){0};
   UNROLL(k, 0, RANK) {
     const int column = next_column(w, k, squares, limits, (uint64_t)((1 << N) - (1 << k)));
-    double v[N], norm2 = 0.0;
+    double v[N], norms[2] = {0.0, 0.0};
     vec s[WIDE];
     EACH(b, WIDE) s[b] = (vec){0};
     UNROLL(i, k, N) {
       v[i] = AT(X[i], column);
-      norm2 += v[i] * v[i];
+      norms[i & 1] += v[i] * v[i];
       EACH(b, WIDE) s[b] += v[i] * X[i][b];
     }
+    const double norm2 = norms[0] + norms[1];
     const double alpha = v[k], beta = -copysign(sqrt(norm2), alpha), by = 1.0 / beta;
     const double scale = norm2 > 0.0 ? 1.0 / (alpha - beta) : 0.0;
     pivots[k] = fabs(beta);
@@ -445,6 +484,13 @@ static inline void reflect(const Factors *w, int k, double *restrict x) {
   EACH(b, HIGH) ((vec *)x)[b] -= s * w->V[k][b];
 }
 
+static ALWAYS_INLINE void solve_pivot(const Factors *w, int k, vec *restrict left,
+                                      double *restrict x) {
+  const int row = w->pivot_row[k];
+  const double y = x[row] = AT(left, w->order[k]) * w->inverse_pivot[k];
+  EACH(b, WIDE) left[b] -= y * w->X[row][b];
+}
+
 @TIMES_Q@
 
 /* x = Q x or, transposed, x = Q^T x, with the first `rank` reflections. */
@@ -461,25 +507,25 @@ void srm_mbs_times_q(const void *work, int rank, int transposed, double *restric
   memcpy(white, x, N * sizeof *white);
 }
 
-static ALWAYS_INLINE void solve_pivot(const Factors *w, int k, vec *restrict left,
-                                      double *restrict x) {
-  const int row = PIVOT_ROW(w, k);
-  const double y = x[row] = AT(left, w->order[k]) * w->inverse_pivot[k];
-  EACH(b, WIDE) left[b] -= y * w->X[row][b];
+static __attribute__((noinline, cold)) void deficient_normal(const Factors *w, int rank,
+                                                            const double *g, double *white) {
+  vec left[WIDE] = {{0}}, x[HIGH] = {{0}};
+  memcpy(left, g, ROWS * sizeof *g);
+  for (int k = 0; k < rank; ++k) solve_pivot(w, k, left, (double *)x);
+  for (int k = rank; k-- > 0;) reflect(w, k, (double *)x);
+  memcpy(white, x, N * sizeof *white);
 }
 
 /* white = Q R^-T Pi^T g */
 void srm_mbs_normal(const void *work, int rank, const double *restrict g, double *restrict white) {
   const Factors *const w = work;
-  vec left[WIDE] = {{0}}, x[HIGH] = {{0}};
-  memcpy(left, g, ROWS * sizeof *g);
-  if (rank == RANK) {
-    UP(k, RANK) solve_pivot(w, k, left, (double *)x);
-    times_q(w, (double *)x);
-  } else {
-    for (int k = 0; k < rank; ++k) solve_pivot(w, k, left, (double *)x);
-    for (int k = rank; k-- > 0;) reflect(w, k, (double *)x);
+  if (rank < RANK) {
+    deficient_normal(w, rank, g, white);
+    return;
   }
+  vec x[HIGH] = {{0}};
+  solve_pivots(w, g, (double *)x);
+  times_q(w, (double *)x);
   memcpy(white, x, N * sizeof *white);
 }
 
@@ -530,9 +576,10 @@ void srm_mbs_unwhiten(const void *work, double *restrict x) {
   double t[N];
   DOWN(k, N) {
     const double *const u = (const double *)w->U[k];
-    double sum = x[k];
-    LATER(i, k) sum -= u[i] * t[i];
-    t[k] = sum * w->inverse[k];
+    const double by = w->inverse[k];
+    double sum = by * x[k];
+    LATER(i, k) sum -= (by * u[i]) * t[i];  /* what was known last comes last */
+    t[k] = sum;
   }
   for (int k = 0; k < N; ++k) x[N - 1 - k] = t[k];
 }

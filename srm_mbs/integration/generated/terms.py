@@ -110,6 +110,22 @@ def gradient_of(spin: Vector, spin_bias: Vector) -> Matrix:
     )
 
 
+def turning_moment(body: Body, own: Moments) -> Vector:
+    r"""I \alpha + \omega x I \omega of a body about its mass centre.
+
+    It is the sum of x x (B x) dm with the gradient B of the acceleration, in which products of the
+    spin are known already: two thirds of the operations of both products with I.
+    """
+    (x, y, z), (a, b, c) = body.spin, body.spin_bias
+    (_, xy, xz), (yx, _, yz), (zx, zy, _) = body.gradient
+    xx, yy, zz = x * x, y * y, z * z
+    return (
+        own.xx * a + (y * z) * (own.zz - own.yy) + own.xz * yx - own.xy * zx + own.yz * (yy - zz),
+        own.yy * b + (x * z) * (own.xx - own.zz) + own.xy * zy - own.yz * xy + own.xz * (zz - xx),
+        own.zz * c + (x * y) * (own.yy - own.xx) + own.yz * xz - own.xz * yz + own.xy * (xx - yy),
+    )
+
+
 class Inertia(NamedTuple):
     """Mass, mass centre and moments about it, in world axes."""
 
@@ -353,9 +369,7 @@ class Trace:
             force = scaled(inertia.mass, body.point_bias(inertia.centre))
             moment = cross(inertia.centre, force)
         if not inertia.moments.is_zero:
-            momentum = inertia.moments.times(body.spin)
-            moment = add(moment, inertia.moments.times(body.spin_bias))
-            moment = add(moment, cross(body.spin, momentum))
+            moment = add(moment, turning_moment(body, inertia.moments))
         return force, moment
 
     def tree(self) -> None:

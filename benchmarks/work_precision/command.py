@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import srm_mbs as srm
@@ -102,17 +103,49 @@ def main(arguments: Sequence[str]) -> int:
                 file=sys.stderr,
             )
             return 2
-    # From an empty cache, so that the time of compilation is measured as well.
-    with tempfile.TemporaryDirectory() as cache:
-        os.environ |= {"SRM_MBS_BACKEND": chosen.backend, "SRM_MBS_CACHE": cache}
-        _measure(chosen)
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    os.environ["SRM_MBS_BACKEND"] = chosen.backend
+    path = chosen.out / FILE
+    _begun(path, chosen).save(path)
+    if "work" in chosen.sections:
+        for number, name in enumerate(chosen.problems, 1):
+            _say(f"[{number}/{len(chosen.problems)}]")
+            _apart(_work, argparse.Namespace(**vars(chosen) | {"problems": [name]}))
+    if set(chosen.sections) != {"work"}:
+        _apart(_other_sections, chosen)
+    written = [path, *plots.draw(records.load(path), chosen.out)]
+    written.append(tables.write(records.load(path), chosen.out))
+    for each in written:
+        _say(f"written: {each}")
     return 0
 
 
-def _measure(chosen: argparse.Namespace) -> None:
-    """Measure and write what the command's options ask for."""
-    chosen.out.mkdir(parents=True, exist_ok=True)
-    path = chosen.out / FILE
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+def _apart(measure: Callable[[argparse.Namespace], None], chosen: argparse.Namespace) -> None:
+    """``measure(chosen)`` in a process of its own, from an empty cache of compiled code.
+
+    So the time of compilation is measured as well, of every problem: compiled code and that of
+    other simulators serve all mechanisms of one process that share it.
+
+    Raises
+    ------
+    SystemExit
+        If the process fails; what other processes measured is kept.
+    """
+    with tempfile.TemporaryDirectory() as cache:
+        os.environ["SRM_MBS_CACHE"] = cache
+        process = multiprocessing.get_context("spawn").Process(target=measure, args=(chosen,))
+        process.start()
+        process.join()
+    if process.exitcode:
+        sys.exit(f"error: the measurement ended with exit status {process.exitcode}")
+
+
+def _begun(path: Path, chosen: argparse.Namespace) -> records.Results:
+    """The results in the file that the sections of ``chosen`` do not measure again."""
     results = records.Results(
         machine.describe(),
         machine.versions(),
@@ -125,46 +158,43 @@ def _measure(chosen: argparse.Namespace) -> None:
     )
     if path.exists():
         try:
-            results = records.continued(
-                path, results, chosen.sections, chosen.problems, chosen.peers
-            )
+            return records.continued(path, results, chosen.sections, chosen.problems, chosen.peers)
         except ValueError as error:
             parser().error(f"{error}: choose another --out")
-    peers = [PEERS[name] for name in chosen.peers]
+    return results
 
-    def say(text: str) -> None:
-        print(text, flush=True)
 
-    def save() -> None:
-        results.save(path)
+def _work(chosen: argparse.Namespace) -> None:
+    """The section "work" of the one problem of ``chosen``, added to the file."""
+    path = chosen.out / FILE
+    results = records.load(path)
+    measure_problem(
+        PROBLEMS[chosen.problems[0]](),
+        [PEERS[name] for name in chosen.peers],
+        results,
+        repeats=chosen.repeats,
+        limit=chosen.limit,
+        choose=(lambda settings: settings[::3]) if chosen.thin else (lambda x: x),
+        say=_say,
+        save=lambda: results.save(path),
+    )
+    results.save(path)
 
-    if "work" in chosen.sections:
-        for number, name in enumerate(chosen.problems, 1):
-            say(f"[{number}/{len(chosen.problems)}]")
-            measure_problem(
-                PROBLEMS[name](),
-                peers,
-                results,
-                repeats=chosen.repeats,
-                limit=chosen.limit,
-                choose=(lambda settings: settings[::3]) if chosen.thin else (lambda x: x),
-                say=say,
-                save=save,
-            )
+
+def _other_sections(chosen: argparse.Namespace) -> None:
+    """The sections of ``chosen`` but "work", added to the file."""
+    path = chosen.out / FILE
+    results = records.load(path)
     if "reliability" in chosen.sections:
-        measure_reliability(peers, results, thin=chosen.thin, say=say)
-        save()
+        peers = [PEERS[name] for name in chosen.peers]
+        measure_reliability(peers, results, thin=chosen.thin, say=_say)
+        results.save(path)
     if "unneeded" in chosen.sections:
-        measure_unneeded(results, repeats=chosen.repeats, thin=chosen.thin, say=say)
-        save()
+        measure_unneeded(results, repeats=chosen.repeats, thin=chosen.thin, say=_say)
+        results.save(path)
     if "scaling" in chosen.sections:
-        measure_scaling(results, repeats=chosen.repeats, thin=chosen.thin, say=say)
-        save()
-    save()
-    written = [path, *plots.draw(records.load(path), chosen.out)]
-    written.append(tables.write(records.load(path), chosen.out))
-    for each in written:
-        say(f"written: {each}")
+        measure_scaling(results, repeats=chosen.repeats, thin=chosen.thin, say=_say)
+        results.save(path)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
@@ -190,6 +191,8 @@ def measure_problem(
             say(f"  {peer.name:28s} skipped: {reason}")
             results.skipped.append(Skipped(peer.name, reason, problem.name))
             continue
+        for module in peer.modules:  # an import is no part of building a model
+            importlib.import_module(module)
         try:
             peer.check(problem)
             build, _, runner = timing.once(lambda peer=peer: peer.prepare(problem))

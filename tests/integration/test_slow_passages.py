@@ -182,7 +182,13 @@ def test_errors_fall_with_the_tolerance_however_far_the_linkage_reaches(
     assert error < 1e-10 + 100.0 * tol
 
 
-FREEDOM = {"driven": (True, False), "driven, free": (True, True), "free": (False, True)}
+FREEDOM = {
+    "driven": (True, False),
+    "driven, free": (True, True),
+    "driven, ball joint": (True, True, True),
+    "free": (False, True),
+    "free, ball joint": (False, True, True),
+}
 REACHES = (0.0, 0.1, 1e-3, 1e-5, 1e-7, -1e-7, -1e-5, -1e-3, -0.1)
 
 

@@ -221,25 +221,35 @@ def _solved(field: Any, start: Any, t: Any) -> np.ndarray:
     return np.asarray(run.y)
 
 
-def moving(reach: float, driven: bool, pendulum: bool) -> Motion:
+def moving(reach: float, driven: bool, pendulum: bool, ball: bool = False) -> Motion:
     """The linkage with its input driven by a sine or free, with or without a rod of 1 m and 1 kg
-    that swings at the tip of the crank."""
+    that swings at the tip of the crank: on a hinge, or in the same plane on a ball joint."""
     own = mechanism(reach)
-    model, joints = own.model.copy(), ["input", "coupler", "crank", "rod"]
+    model = own.model.copy()
     if pendulum:
-        at = model.getJointId("crank")
-        add_link(model, at, pin.JointModelRZ(), "pendulum", rod(1.0, 1.0), along_x(BAR))
-        joints.append("pendulum")
-    order = [model.joints[model.getJointId(name)].idx_q for name in joints]
+        hinge = pin.JointModelSpherical() if ball else pin.JointModelRZ()
+        thick = rod(1.0, 1.0)
+        thick.inertia = thick.inertia + 0.01 * np.diag([1.0, 0.0, 0.0])  # regular about the rod
+        add_link(model, model.getJointId("crank"), hinge, "pendulum", thick, along_x(BAR))
+    order = [model.getJointId(name) for name in ("input", "coupler", "crank", "rod")]
 
     def whole(psi: Any, rate: Any, chi: Any, swing: Any) -> tuple[np.ndarray, np.ndarray]:
         coupler, crank = np.array([_angles(x, reach) for x in psi]).T
         dcoupler, dcrank = np.array([_rates(x, reach) for x in psi]).T * rate
-        q, v = np.zeros((2, len(psi), len(order)))
-        angles = [psi, coupler - psi, crank, -2.0 * crank, chi - crank]
-        rates = [rate, dcoupler - rate, dcrank, -2.0 * dcrank, swing - dcrank]
-        for column, angle, own_rate in zip(order, angles, rates):
-            q[:, column], v[:, column] = angle, own_rate
+        q, v = np.zeros((len(psi), model.nq)), np.zeros((len(psi), model.nv))
+        angles = [psi, coupler - psi, crank, -2.0 * crank]
+        rates = [rate, dcoupler - rate, dcrank, -2.0 * dcrank]
+        for joint, angle, own_rate in zip(order, angles, rates):
+            q[:, model.idx_qs[joint]], v[:, model.idx_vs[joint]] = angle, own_rate
+        if pendulum:
+            joint, half = model.getJointId("pendulum"), 0.5 * (chi - crank)
+            at, last = model.idx_qs[joint], model.idx_vs[joint] + model.nvs[joint] - 1
+            q[:, at : at + model.nqs[joint]] = (
+                np.column_stack([0.0 * half, 0.0 * half, np.sin(half), np.cos(half)])
+                if ball
+                else 2.0 * half[:, None]
+            )
+            v[:, last] = swing - dcrank
         return q, v
 
     def exact(t: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.integration import singular_endpoints
+from srm_mbs.integration.control.placement import error_of_parabola
 from tests.support import reduced, slider_crank
 from tests.support.bundled import load
 from tests.support.lockstep import compare
@@ -121,6 +122,19 @@ def test_the_kernel_prepares_for_such_an_end_as_the_reference_does(
     assert not comparison.decisions
     assert comparison.h < 1e-9
     assert comparison.near < 1e-10
+
+
+def test_a_zero_of_sigma_is_not_foreseen_where_sigma_is_no_parabola() -> None:
+    """sigma falls by a polynomial of third degree, or jumps where pivots change."""
+    c = np.array([0.0, 0.1, 0.3, 0.45, 0.7, 0.9, 1.0])
+    cubic = c * (c - 0.45) * (c - 1.0)
+    for a, b, ahead in ((-0.1, 0.0, 1.5), (-0.1, -0.02, 2.0), (-0.3, 0.05, 1.2)):
+        parabola = 0.3 + c * (a + c * b)
+        assert error_of_parabola(c, 3, parabola, ahead) < 1e-14
+        expected = 0.01 * ahead * (ahead - 0.45) * (ahead - 1.0)
+        assert error_of_parabola(c, 3, parabola + 0.01 * cubic, ahead) == pytest.approx(expected)
+    jumps = 0.3 - 0.1 * c + np.array([0.0, 0.0, 0.005, 0.0, 0.0, 0.0, 0.0])
+    assert error_of_parabola(c, 3, jumps, 2.0) > singular_endpoints.SINGULAR_END_SIGMA
 
 
 @pytest.mark.parametrize("backend", ["kernel", "python"])

@@ -176,6 +176,9 @@ bool SingularityPlacement::arrives(double t, const Proposal& proposal) const {
     if (arrival_ != Arrival::watched) return arrival_ == Arrival::due;
     if (!(zero_ > t) || !(std::abs(zero_ - t_end_) * slope_ < constants_.singular_end))
         return false;
+    // Of many loops sigma is no parabola, and its zero not known that well: only the step to the
+    // end will tell.
+    if (!(zero_error_ < constants_.singular_end)) return false;
     return proposal.t_new >= t_end_ ||
            (t_end_ - t) * slope_ <= constants_.arrival_sigma_change;
 }
@@ -262,6 +265,7 @@ StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepRe
             const double ahead = zero_ahead(abscissae[middle], start, sigmas[middle], end,
                                             constants_.zero_horizon);
             zero_ = result->t + h * ahead;
+            zero_error_ = error_of_parabola(abscissae, middle, sigmas, ahead);
             if (ahead < 1.0 + constants_.expected_steps) expected_ = zero_;
         }
         if (std::isnan(expected_) && end < start && end < constants_.expected_sigma)
@@ -388,6 +392,25 @@ private:
 
 }  // namespace
 
+Parabola::Parabola(double c, double start_, double middle, double end) : start(start_) {
+    const bool inside = 0.1 < c && c < 0.9;
+    b = inside ? ((middle - start) / c - (end - start)) / (c - 1.0) : 0.0;
+    a = end - start - b;
+}
+
+double error_of_parabola(const std::vector<double>& abscissae, int middle,
+                         const std::vector<double>& sigmas, double ahead) {
+    const double c = abscissae[middle];
+    const Parabola parabola(c, sigmas[0], sigmas[middle], sigmas.back());
+    const auto cubic = [c](double x) { return std::abs(x * (x - c) * (x - 1.0)); };
+    double misfit = 0.0, largest_cubic = 0.0;
+    for (std::size_t j = 0; j < sigmas.size(); ++j) {
+        misfit = std::max(misfit, std::abs(parabola(abscissae[j]) - sigmas[j]));
+        largest_cubic = std::max(largest_cubic, cubic(abscissae[j]));
+    }
+    return largest_cubic > 0.0 ? misfit * cubic(ahead) / largest_cubic : misfit;
+}
+
 double zero_within(const std::vector<double>& abscissae, const std::vector<double>& sigmas) {
     const int n = static_cast<int>(abscissae.size());
     std::vector<int> order(n);
@@ -441,16 +464,15 @@ double extreme_sigma(const std::vector<double>& abscissae, int middle,
     for (const auto& [sign, last_sign] :
          {std::pair{1.0, 1.0}, {1.0, -1.0}, {-1.0, -1.0}, {-1.0, 1.0}}) {
         const double end = last_sign * sigmas.back();
-        const double b = ((sign * sigmas[middle] - start) / c - (end - start)) / (c - 1.0);
-        const double a = end - start - b;
+        const Parabola parabola(c, start, sign * sigmas[middle], end);
         double misfit = 0.0;
         for (std::size_t j = 0; j < sigmas.size(); ++j) {
-            const double x = abscissae[j];
-            const double off = std::abs(start + x * (a + x * b)) - sigmas[j];
+            const double off = std::abs(parabola(abscissae[j])) - sigmas[j];
             misfit += off * off;
         }
         if (!(misfit < best)) continue;
         best = misfit;
+        const double a = parabola.a, b = parabola.b;
         extreme = b == 0.0 ? inf : start - a * a / (4.0 * b);
     }
     const auto [low, high] = std::minmax_element(sigmas.begin(), sigmas.end());
@@ -463,16 +485,12 @@ double zero_ahead(double c, double start, double middle, double end, double hori
     const double line = start / (start - end);
     const double within = line > horizon ? nan : line;
     double zero = line;
-    if (0.1 < c && c < 0.9) {
-        // sigma = start + a x + b x^2 through (c, middle) and (1, end)
-        const double b = ((middle - start) / c - (end - start)) / (c - 1.0);
-        const double a = end - start - b;
-        const double root = a * a - 4.0 * b * start;
-        if (root >= 0.0 && a < 0.0) {
-            zero = 2.0 * start / (-a + std::sqrt(root));
-        } else if (a + 2.0 * b >= 0.0 || root < 0.0) {
-            return within;
-        }
+    const Parabola parabola(c, start, middle, end);
+    const double a = parabola.a, b = parabola.b, root = a * a - 4.0 * b * start;
+    if (root >= 0.0 && a < 0.0) {
+        zero = 2.0 * start / (-a + std::sqrt(root));
+    } else if (a + 2.0 * b >= 0.0 || root < 0.0) {
+        return within;
     }
     if (1.0 < zero && zero < horizon) return zero;
     return 1.0 < line && line < horizon && zero <= 1.0 ? line : nan;

@@ -31,6 +31,7 @@ struct Proposal {
        the last one (s) or 0, its tries, state of the arrival. */                           \
     field(double, slope)                                                                    \
     field(double, zero)                                                                     \
+    field(double, zero_error) /* of sigma there */                                          \
     field(double, expected) /* the zero that is examined (s), or NaN */                     \
     field(double, redo)                                                                     \
     field(int, redone)                                                                      \
@@ -190,6 +191,7 @@ public:
         arrival_ = static_cast<Arrival>(s.arrival);
         slope_ = s.slope;
         zero_ = s.zero;
+        zero_error_ = s.zero_error;
         expected_ = s.expected;
         redo_ = s.redo;
         redone_ = s.redone;
@@ -201,6 +203,7 @@ public:
         s.arrival = static_cast<int>(arrival_);
         s.slope = slope_;
         s.zero = zero_;
+        s.zero_error = zero_error_;
         s.expected = expected_;
         s.redo = redo_;
         s.redone = redone_;
@@ -227,7 +230,7 @@ private:
     bool turning_ = false, lost_branch_ = false;
     StagePlaces members_[2];
     const StagePlaces* places_ = &members_[0];
-    double slope_ = 0.0, zero_, redo_ = 0.0;
+    double slope_ = 0.0, zero_, zero_error_ = 0.0, redo_ = 0.0;
     double expected_ = std::numeric_limits<double>::quiet_NaN();
     int redone_ = 0;
 };
@@ -287,6 +290,19 @@ private:
     mutable std::vector<double> work_;
 };
 
+// sigma = start + a x + b x^2 over a step.
+struct Parabola {
+    // Through (c, middle) and (1, end); the line through (1, end) if c is next to an end of the step.
+    Parabola(double c, double start, double middle, double end);
+    double operator()(double x) const { return start + x * (a + x * b); }
+
+    double start, a, b;
+};
+
+// Error of the parabola through sigma at the start, the stage `middle` and the end of a step at
+// `ahead` steps from its start, if its largest misfit at the stages is that of a cubic term.
+double error_of_parabola(const std::vector<double>& abscissae, int middle,
+                         const std::vector<double>& sigmas, double ahead);
 // The zero of sigma in (0, 1 + a little] of a step; NaN without one.
 double zero_within(const std::vector<double>& abscissae, const std::vector<double>& sigmas);
 // The next zero of sigma, in steps from the start of the last one; NaN if it is further than

@@ -27,7 +27,7 @@ void MultiplierHistory::forget_known() {
 }
 
 void MultiplierHistory::extend(double t, const double* value,
-                               const std::vector<double>& new_normals,
+                               std::vector<double>&& new_normals,
                                const std::vector<double>& new_away) {
     int kept = 0;
     while (kept < size() && times[kept] < t) ++kept;
@@ -41,7 +41,7 @@ void MultiplierHistory::extend(double t, const double* value,
         values.erase(values.begin(), values.begin() + static_cast<std::ptrdiff_t>(extra) * nv);
     }
     forget_known();
-    normals = new_normals;
+    normals.swap(new_normals);
     away = new_away;
 }
 

@@ -32,8 +32,9 @@ public:
     int normal_count() const { return nv > 0 ? static_cast<int>(normals.size()) / nv : 0; }
     bool begun() const { return !times.empty(); }
     void clear();
-    // Adds the multiplier at t; the newest `points` nodes are kept, those after t dropped.
-    void extend(double t, const double* value, const std::vector<double>& normals,
+    // Adds the multiplier at t; the newest `points` nodes are kept, those after t dropped.  The
+    // normals are exchanged with those before, so that no step allocates them.
+    void extend(double t, const double* value, std::vector<double>&& normals,
                 const std::vector<double>& away);
     void predict(double t, double* out) const;
     // Predicts unless t is too far from the nodes; whether it does.

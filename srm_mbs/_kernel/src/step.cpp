@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 #include "errors.hpp"
 #include "linear.hpp"
@@ -552,7 +553,6 @@ void SplitStep::finish(double theta, bool constrained) {
     StepResult& r = result;
     const double sigma = r.sigmas[scheme.stages()];
     r.has_multiplier = false;
-    r.normals.clear();
     r.away.clear();
     if (!constrained) {
         std::copy(x_.begin(), x_.end(), r.state.begin());
@@ -566,6 +566,7 @@ void SplitStep::finish(double theta, bool constrained) {
         r.multiplier = nodes_->multiplier;
         r.away = nodes_->away;
         r.has_multiplier = true;
+        r.normals.clear();
         return;
     }
     const bool rank_deficient = system_.rank_deficient();
@@ -582,8 +583,11 @@ void SplitStep::finish(double theta, bool constrained) {
     if (!rank_deficient && (monitored_ || sigma < constants.monitored_below)) {
         system_.multiplier(r.multiplier.data());
         r.has_multiplier = true;
-        if (sigma < constants.monitored_below) system_.normals(r.normals);
     }
+    if (!rank_deficient && sigma < constants.monitored_below)
+        system_.normals(r.normals);
+    else
+        r.normals.clear();
     if (moved_end_) add(1.0, moved_.data(), r.correction.data(), n_);
 }
 
@@ -645,7 +649,7 @@ void SplitStep::accept(IntegratorState& memory) {
     std::copy(r.state_scale.begin(), r.state_scale.end(), memory.state_scale.begin());
     if (!memory.history) return;
     if (r.has_multiplier)
-        memory.history->extend(r.t + r.h, r.multiplier.data(), r.normals, r.away);
+        memory.history->extend(r.t + r.h, r.multiplier.data(), std::move(result.normals), r.away);
     else if (!r.in_zone && memory.history->begun())
         memory.history->clear();
 }

@@ -20,8 +20,9 @@ from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 _NO_NUMBERS = np.zeros(0)
-KEPT_SUPPORTS = 256
-"""Closures whose coordinates are kept: variants of a mechanism have the same."""
+KEPT_SUPPORTS = 2048
+"""Closures whose coordinates are kept: variants of a mechanism have the same.  Runs ask for all in
+turn: of a mechanism with more closures none would still be there."""
 
 
 def closure_structs(constants: dict[str, Any]) -> dict[str, Any]:

@@ -109,6 +109,31 @@ def zero_within(abscissae: FloatArray, sigmas: FloatArray) -> float | None:
     return None
 
 
+def parabola(c: float, start: float, middle: float, end: float) -> tuple[float, float]:
+    """a and b of sigma = start + a x + b x^2 through (c, middle) and (1, end); of the line through
+    (1, end) if c is next to an end of the step."""
+    b = ((middle - start) / c - (end - start)) / (c - 1.0) if 0.1 < c < 0.9 else 0.0
+    return end - start - b, b
+
+
+def error_of_parabola(
+    abscissae: FloatArray, middle: int, sigmas: FloatArray, ahead: float
+) -> float:
+    """Error of a step's :func:`parabola` at ``ahead`` steps from its start, if its largest misfit
+    at the stages is that of a cubic term.
+
+    Parameters
+    ----------
+    abscissae, sigmas : (s + 1,)
+        Fractions of the step, and sigma there.
+    """
+    c, start, end = float(abscissae[middle]), float(sigmas[0]), float(sigmas[-1])
+    a, b = parabola(c, start, float(sigmas[middle]), end)
+    misfit = float(np.abs(start + abscissae * (a + abscissae * b) - sigmas).max())
+    cubic = float(np.abs(abscissae * (abscissae - c) * (abscissae - 1.0)).max())
+    return misfit * abs(ahead * (ahead - c) * (ahead - 1.0)) / cubic if cubic > 0.0 else misfit
+
+
 def zero_ahead(k: int, c: float, sigmas: FloatArray) -> float | None:
     """Where sigma will vanish, in steps from the start of the last one (> 1); None if it does not
     fall, or not within ``PREDICTION_STEPS`` steps.
@@ -119,18 +144,14 @@ def zero_ahead(k: int, c: float, sigmas: FloatArray) -> float | None:
     start, end = float(sigmas[0]), float(sigmas[-1])
     if not end < start:
         return None
-    middle = float(sigmas[k])
     line = start / (start - end)
     zero = line
-    if 0.1 < c < 0.9:
-        # sigma = start + a x + b x^2 through (c, middle) and (1, end)
-        b = ((middle - start) / c - (end - start)) / (c - 1.0)
-        a = end - start - b
-        root = a * a - 4.0 * b * start
-        if root >= 0.0 and a < 0.0:
-            zero = 2.0 * start / (-a + np.sqrt(root))
-        elif a + 2.0 * b >= 0.0 or root < 0.0:
-            return None if line > PREDICTION_STEPS else line
+    a, b = parabola(c, start, float(sigmas[k]), end)
+    root = a * a - 4.0 * b * start
+    if root >= 0.0 and a < 0.0:
+        zero = 2.0 * start / (-a + np.sqrt(root))
+    elif a + 2.0 * b >= 0.0 or root < 0.0:
+        return None if line > PREDICTION_STEPS else line
     if zero <= 1.0:
         zero = line
     return float(zero) if 1.0 < zero < PREDICTION_STEPS else None
@@ -167,9 +188,7 @@ def extreme_sigma(abscissae: FloatArray, middle: int, sigmas: FloatArray) -> flo
     start = float(sigmas[0])
     best, extreme = np.inf, np.inf
     for sign, last_sign in ((1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0)):
-        end = last_sign * float(sigmas[-1])
-        b = ((sign * float(sigmas[middle]) - start) / c - (end - start)) / (c - 1.0)
-        a = end - start - b
+        a, b = parabola(c, start, sign * float(sigmas[middle]), last_sign * float(sigmas[-1]))
         off = np.abs(start + abscissae * (a + abscissae * b)) - sigmas
         misfit = float(off @ off)
         if misfit < best:
@@ -280,6 +299,7 @@ class SingularityPlacement(ControlWrapper):
         self._places = self._members[False]
         self._slope = 0.0
         self._zero: float | None = None
+        self._zero_error = 0.0
         self._expected: float | None = None
         self._redo: float | None = None
         self._redone = 0
@@ -355,6 +375,10 @@ class SingularityPlacement(ControlWrapper):
         if self._zero is None or not self._zero > t:
             return False
         if not abs(self._zero - self._t_end) * self._slope < SINGULAR_END_SIGMA:
+            return False
+        # Of many loops sigma is no parabola, and its zero not known that well: only the step to the
+        # end will tell.
+        if not self._zero_error < SINGULAR_END_SIGMA:
             return False
         return (
             proposal.t_new >= self._t_end or (self._t_end - t) * self._slope <= ARRIVAL_SIGMA_CHANGE
@@ -433,7 +457,11 @@ class SingularityPlacement(ControlWrapper):
                     slow = self._slope * proposal.h < SLOW_SIGMA_CHANGE
                     self._turning = slow or abs(extreme) < TURNING_SIGMA
                 ahead = zero_ahead(*places.middle, result.sigmas)
-                self._zero = None if ahead is None else result.t + proposal.h * ahead
+                if ahead is not None:
+                    self._zero = result.t + proposal.h * ahead
+                    self._zero_error = error_of_parabola(
+                        places.abscissae, places.middle[0], result.sigmas, ahead
+                    )
             expected = expected_zero(result.sigmas, ahead)
             self._expected = None if expected is None else result.t + proposal.h * expected
         return decision

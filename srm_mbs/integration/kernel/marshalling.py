@@ -290,6 +290,7 @@ _CONTROL_START = {
     "index": 1,
     "slope": 0.0,
     "zero": np.nan,
+    "zero_error": 0.0,
     "expected": np.nan,
     "redo": 0.0,
     "redone": 0,

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -57,6 +58,8 @@ SAMPLES_PER_INTERVAL = 4
 """Samples on the dense output per interval between two stages."""
 DEPARTED_VALUE = 0.02
 """Part of the largest singular value of a window above which the motion has left a minimum."""
+LEAST_DEPARTED = 1e-12
+"""The same value where that part is rounding."""
 MINIMUM_DEPTH = 0.5
 """Largest value of a minimum, over those at its sides."""
 SINGULAR_VALUE = 1e-5
@@ -435,7 +438,14 @@ class Crossing:
 
 
 def _recorded(scheme: ButcherTableau, steps: StepData) -> tuple[FloatArray, FloatArray]:
-    """Times and sigmas of the stages in order of time, each time once."""
+    """Times and sigmas of the stages in order of time, each time once, up to the end of the run."""
+    t, sigma = _of_stages(scheme, steps)
+    inside = t <= steps.end
+    return t[inside], sigma[inside]
+
+
+def _of_stages(scheme: ButcherTableau, steps: StepData) -> tuple[FloatArray, FloatArray]:
+    """Those of whole steps."""
     h = np.diff(steps.times)
     if not np.logical_or.reduce(steps.stiff):  # stages in the same order in all steps
         own = scheme.member(False)
@@ -455,28 +465,6 @@ def _recorded(scheme: ButcherTableau, steps: StepData) -> tuple[FloatArray, Floa
     step_of = np.concatenate([[0], step_of])
     fresh = np.concatenate([[True], np.diff(t) > SAME_STAGE * h[step_of[1:]]])
     return t[fresh], sigma[fresh]
-
-
-def _stays_away(scheme: ButcherTableau, steps: StepData) -> bool:
-    """Whether no interval between stages can be one of :func:`_may_vanish`: in each step the lowest
-    sigma, less the change that the steepest slope of the steps around allows in its longest
-    interval, bounds the lowest sigma of all.  Of one scheme only."""
-    if np.logical_or.reduce(steps.stiff):
-        return False
-    own = scheme.member(False)
-    lengths = own.intervals
-    # Samples of one time next to each other: reductions along them take whole vectors.
-    sigma = np.empty((len(lengths) + 1, steps.count))
-    sigma[1:] = steps.sigmas.T[own.distinct]
-    sigma[0, 0], sigma[0, 1:] = steps.sigmas[0, 0], sigma[-1, :-1]
-    lowest = np.minimum.reduce(sigma)
-    if not np.minimum.reduce(lowest) >= LINGERING_SIGMA:
-        return False
-    h = steps.times[1:] - steps.times[:-1]
-    slopes = np.maximum.reduce(np.abs(sigma[1:] - sigma[:-1]) / lengths[:, None]) / h
-    reach = -(-scheme.n_stages // len(lengths))  # steps within n_stages samples
-    lowest -= 0.5 * SLOPE_MARGIN * max(lengths) * h * _largest(slopes, reach, reach)
-    return bool(np.minimum.reduce(lowest) >= VANISHING_SIGMA * np.maximum.reduce(sigma, axis=None))
 
 
 def _lowest(t: FloatArray, sigma: FloatArray, around: int) -> FloatArray:
@@ -519,12 +507,37 @@ def _windows(marked: BoolArray) -> IndexArray:
     return edges.reshape(-1, 2)
 
 
-def _dips(
+RecordedDips = tuple[FloatArray, list[list[int]], list[int]]
+"""Times (k,) s of the recorded samples; minima of sigma that may be crossings, in order, as
+indices (n, 3) of samples, the minimum between those on both sides where it is left; and for each
+the index of the largest sigma in its window."""
+
+
+def recorded_dips(scheme: ButcherTableau, steps: StepData) -> RecordedDips | None:
+    """The minima of the sigmas at the stages of ``steps`` that may be crossings; None if there are
+    none."""
+    return _dips(*_recorded(scheme, steps), scheme.n_stages)
+
+
+def _dips(t: FloatArray, sigma: FloatArray, around: int) -> RecordedDips | None:
+    """The same of samples ``sigma`` (k,) at t (k,)."""
+    if len(t) < 3 or not np.isfinite(sigma).all():
+        return None
+    lowest = _lowest(t, sigma, around)
+    windows = _windows(_may_vanish(sigma, lowest, around))
+    if not len(windows):
+        return None
+    dips, window_of = _dips_in(sigma, lowest, windows)
+    if not len(dips):
+        return None
+    tops = [a + int(sigma[a : b + 1].argmax()) for a, b in windows[window_of].tolist()]
+    return t, dips.tolist(), tops
+
+
+def _dips_in(
     sigma: FloatArray, lowest: FloatArray, windows: IndexArray
 ) -> tuple[IndexArray, IndexArray]:
-    """Minima of the recorded ``sigma`` (k,) in the ``windows`` (m, 2) that may be crossings, in
-    order: samples (n, 3), the minimum between those on both sides where it is left, and the window
-    (n,) of each.
+    """Samples (n, 3) of those minima in the ``windows`` (m, 2), and the window (n,) of each.
 
     ``lowest`` (k - 1,): between the samples.  At the ends of a run the zero may lie before the
     first or after the last of them.
@@ -541,7 +554,7 @@ def _dips(
     before[starts] = after[ends - 1] = below[starts] = above[ends - 1] = np.inf
     k = np.flatnonzero((size <= before) & (size < after))
     # Of small minima between the same sides, the smallest.
-    departed = np.maximum(DEPARTED_VALUE * np.maximum.reduceat(size, starts), 1e-12)
+    departed = np.maximum(DEPARTED_VALUE * np.maximum.reduceat(size, starts), LEAST_DEPARTED)
     high = size >= departed[own]
     left, right = high.copy(), high
     left[starts] = right[ends - 1] = True
@@ -576,7 +589,7 @@ def _minima(values: FloatArray, scale: float) -> list[tuple[int, int, int]]:
     Small minima between the same sides are one: dense output is rough where steps are tiny.
     ``scale``: the largest value of the window.
     """
-    level = max(DEPARTED_VALUE * scale, 1e-12)
+    level = max(DEPARTED_VALUE * scale, LEAST_DEPARTED)
     found: dict[tuple[int, int], int] = {}
     for k in np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] < values[2:])) + 1:
         first, last = k - 1, k + 1
@@ -623,7 +636,7 @@ def _rank_loss_cosine(
 
 
 def _step_at(steps: StepData, time: float) -> int:
-    return int(np.clip(np.searchsorted(steps.times, time) - 1, 0, steps.count - 1))
+    return min(max(int(steps.times.searchsorted(time)) - 1, 0), steps.count - 1)
 
 
 def _along_curve(steps: StepData, time: float) -> bool:
@@ -688,44 +701,36 @@ def find_crossings(
     scheme: ButcherTableau,
     steps: StepData,
     monitored: Callable[[], tuple[DenseOutput, float]],
+    dips_of: Callable[[ButcherTableau, StepData], RecordedDips | None] = recorded_dips,
 ) -> tuple[Crossing, ...]:
     """All crossings of a run, in order of time.
 
-    ``monitored`` returns its dense output, which runs that stay away from singular configurations
-    do not need, and the residual (row units) up to which a critical configuration counts as
-    singular.
+    Parameters
+    ----------
+    monitored
+        Returns its dense output, which runs that stay away from singular configurations do not
+        need, and the residual (row units) up to which a critical configuration counts as singular.
+    dips_of
+        :func:`recorded_dips` or the kernel's.
     """
     analysis = system.singularities
     if analysis is None or not steps.count:
         return ()
-    sharp = analysis.sigma_reference >= SMALL_REFERENCE_PIVOT
-    if sharp and not steps.critical_ranges and _stays_away(scheme, steps):
-        return ()
-    t, sigma = _recorded(scheme, steps)
-    inside = t <= steps.end
-    t, sigma = t[inside], sigma[inside]
-    if len(t) < 3 or not np.isfinite(sigma).all():
-        return ()
     monitor = None
-    if not sharp:
+    if analysis.sigma_reference >= SMALL_REFERENCE_PIVOT:
+        recorded = dips_of(scheme, steps)
+    else:
         monitor = ConstraintMonitor(analysis, *monitored())
-        sigma = monitor.smallest(t)
-        sigma = sigma / np.median(sigma)
-    lowest = _lowest(t, sigma, scheme.n_stages)
-    windows = _windows(_may_vanish(sigma, lowest, scheme.n_stages))
-    dips, window_of = _dips(sigma, lowest, windows) if len(windows) else (windows, windows[:, 0])
-    if not len(dips) and not steps.critical_ranges:
+        t, _ = _recorded(scheme, steps)
+        values = monitor.smallest(t)
+        recorded = _dips(t, values / np.median(values), scheme.n_stages)
+    if recorded is None and not steps.critical_ranges:
         return ()
     monitor = monitor or ConstraintMonitor(analysis, *monitored())
-    examined = np.flatnonzero(np.bincount(window_of, minlength=len(windows)))
-    tops = [
-        begin + int(np.argmax(sigma[begin : end + 1])) for begin, end in windows[examined].tolist()
-    ]
-    scales = dict(zip(examined.tolist(), monitor.smallest(t[tops] if tops else t[:0]).tolist()))
-    searches = [
-        _crossings_at(monitor, steps, t, dip, scales[window])
-        for dip, window in zip(dips.tolist(), window_of.tolist())
-    ]
+    searches = []
+    if recorded is not None:
+        t, dips, tops = recorded
+        searches = [_crossings_at(monitor, steps, t, *one) for one in zip(dips, tops)]
     found: dict[float, Crossing] = {}
     for crossings in (*monitor.together(searches), _crossings_along_curves(monitor, steps)):
         for crossing in crossings:
@@ -738,16 +743,20 @@ def _crossings_at(
     steps: StepData,
     t: FloatArray,
     dip: Sequence[int],
-    scale: float,
+    top: int,
 ) -> Search[list[Crossing]]:
-    """The crossings at a minimum of sigma, the second of the samples ``dip``, which are indices
-    into t (k,).
+    """The crossings at a minimum of sigma, the second of the samples ``dip``.
 
-    ``scale``: the largest singular value of the window.
+    ``dip`` and ``top``, where sigma of the window is largest, are indices into t (k,).
     """
     first, k, last = dip
-    times = _times_around(t, first, k, last, DIP_WIDTHS[0], 1)
-    values = yield times
+    times = t[sorted({first, max(first, k - 1), k, min(k + 1, last), last})]
+    if len(times) == 2:  # an interval alone shows no slope from which it could differ
+        times = np.insert(times, 1, times.mean())
+    values = yield np.concatenate([times, t[[top]]])
+    scale, values = float(values[-1]), values[:-1]  # that of the window, about the largest
+    if _lowest_between(times, values) >= MINIMUM_DEPTH * values.max():
+        return []  # sigma has it alone, as where the order of its pivots changes
     minima = _minima(values, max(scale, float(values.max())))
     if len(minima) == 1:
         near = slice(minima[0][1] - 1, minima[0][1] + 2)
@@ -799,7 +808,7 @@ def _crossing_at(
     near = slice(k - 1, k + 2)
     before, after = float(times[first]), float(times[last])
     sides = values[[first, last]]
-    if not _lowest_bracketed(times[near], values[near]) < MINIMUM_DEPTH * sides.min():
+    if not _lowest_between(times[near], values[near]) < MINIMUM_DEPTH * sides.min():
         return None
     time, value = lowest or (yield from _minimum(times[near], values[near]))
     if not value < MINIMUM_DEPTH * sides.min() or _along_curve(steps, time):
@@ -821,11 +830,13 @@ def _crossing_at(
     return crossing_at(monitor, steps, time, VELOCITY_VALUE * scale / slope, kind)
 
 
-def _lowest_bracketed(t: FloatArray, values: FloatArray) -> float:
-    """Lowest value between three samples (3,), the middle one the smallest, with a margin for
-    curvature."""
-    slopes = np.abs(np.diff(values)) / np.diff(t)
-    return float(values[1] - SLOPE_MARGIN * slopes.max() * np.diff(t).max())
+def _lowest_between(t: FloatArray, values: FloatArray) -> float:
+    """Lowest of the ``values`` (k,) between samples at t (k,), with a margin for curvature."""
+    samples = list(pairwise(zip(t.tolist(), values.tolist())))
+    steepest = max(abs(after - before) / (b - a) for (a, before), (b, after) in samples)
+    longest = max(b - a for (a, _), (b, _) in samples)
+    lowest: float = values.min() - SLOPE_MARGIN * steepest * longest
+    return lowest
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,7 @@ from srm_mbs.integration.dense_output import (
 )
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import Occurrence
+from srm_mbs.integration.kernel import dense_output as kernel_steps
 from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import CompiledObservables
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -41,6 +42,7 @@ from srm_mbs.integration.singular_passages import (
     Crossing,
     find_bifurcations,
     find_crossings,
+    recorded_dips,
 )
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.lazy import cached_property
@@ -418,11 +420,15 @@ class SimulationResult(RunOutcome):
         """The equations of motion of the run."""
         return self._system
 
+    @property
+    def _by_kernel(self) -> bool:
+        """Whether the kernel made the run and is there."""
+        return self.backend in COMPILED and core is not None
+
     @cached_property
     def observables(self) -> Observables:
         """Quantities at many states of the mechanism, by the backend of the run."""
-        by_kernel = self.backend in COMPILED and core is not None
-        return (CompiledObservables if by_kernel else Observables)(self._system)
+        return (CompiledObservables if self._by_kernel else Observables)(self._system)
 
     @property
     def steps_to_save(self) -> StepData:
@@ -521,7 +527,8 @@ class SimulationResult(RunOutcome):
         def monitored() -> tuple[DenseOutput, float]:
             return self._dense, self.settings.singular_tolerance
 
-        return find_crossings(self._system, self.scheme, self.steps, monitored)
+        dips = kernel_steps.recorded_dips if self._by_kernel else recorded_dips
+        return find_crossings(self._system, self.scheme, self.steps, monitored, dips)
 
     @cached_property
     def bifurcations(self) -> tuple[Bifurcation, ...]:

@@ -95,7 +95,7 @@ def sweep(
     chunk
         Number of cases that a worker runs at a time, which are lost together if it dies.  By
         default as many as take about 0.05 s, by what the last ones took (with executors of other
-        packages 0.5 s): a worker that dies then loses what it did in the last 0.1 s (1 s), and the
+        packages 1 s): a worker that dies then loses what it did in the last 0.1 s (2 s), and the
         case that it was at.
     resume
         A file to which every finished case is appended; the cases that it already has are read
@@ -222,8 +222,9 @@ class _Pace(NamedTuple):
 
 STANDARD = _Pace(0.05, 0.0, 4, 16)
 """With executors of the standard library."""
-SCHEDULED = _Pace(0.5, 0.05, 16, 8)
-"""With others, whose schedulers, as that of Dask, spend 10 ms of CPU time on a chunk."""
+SCHEDULED = _Pace(1.0, 0.1, 64, 4)
+"""With others, whose schedulers and workers, as those of Dask, spend 10 ms of CPU time on a chunk
+beside what it computes: few chunks, at the beginning and at the end as well."""
 
 
 class _Waiting:

@@ -16,8 +16,10 @@ import srm_mbs as srm
 from srm_mbs.dynamics.constraints import structure
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.integration import singular_passages as crossings_module
+from srm_mbs.integration.kernel import dense_output as kernel_steps
 from srm_mbs.integration.singular_passages import ConstraintMonitor
 from tests.support import reduced
+from tests.support.backends import needs_kernel
 from tests.support.bundled import load
 from tests.support.mechanisms import (
     along_x,
@@ -110,20 +112,26 @@ def test_regular_motions_list_no_passage(name: str, tableau: str, tol: float) ->
     assert run(name, 5.0, tableau, tol).crossings == ()
 
 
-def test_bounds_of_whole_steps_rule_out_passages_only_where_those_of_all_intervals_do() -> None:
+@needs_kernel
+@pytest.mark.parametrize("tableau", ["tvd32", "dop853"])
+def test_the_kernel_finds_the_same_minima_of_sigma(tableau: str) -> None:
     """sigma of random motions at the stages of a run, with steps of different lengths."""
-    solution, rng = srm.simulate(load("four_bar"), 4.0), np.random.default_rng(3)
-    scheme, outcomes = solution.scheme, set()
+    solution, rng = srm.simulate(load("four_bar"), 4.0, tableau=tableau), np.random.default_rng(3)
+    scheme, found = solution.scheme, set()
     t = solution.steps.stage_times(scheme)
-    for level in np.linspace(0.1, 1.0, 60):
+    for level in np.linspace(-0.2, 1.0, 60):
         waves = np.sin(np.multiply.outer(rng.uniform(1.0, 20.0, 3), t) + rng.uniform(0.0, 6.0))
         sigmas = np.abs(level + 0.2 * np.tensordot(rng.uniform(0.0, 1.0, 3), waves, axes=1))
-        steps = replace(solution.steps, sigmas=sigmas)
-        times, recorded = crossings_module._recorded(scheme, steps)
-        lowest = crossings_module._lowest(times, recorded, scheme.n_stages)
-        marked = crossings_module._may_vanish(recorded, lowest, scheme.n_stages).any()
-        outcomes.add((crossings_module._stays_away(scheme, steps), bool(marked)))
-    assert outcomes - {(False, False)} == {(True, False), (False, True)}
+        steps = replace(solution.steps, sigmas=sigmas, stop=rng.uniform(*t[-1, [0, -1]]))
+        expected = crossings_module.recorded_dips(scheme, steps)
+        by_kernel = kernel_steps.recorded_dips(scheme, steps)
+        found.add(expected is None)
+        if expected is None or by_kernel is None:
+            assert expected is by_kernel
+            continue
+        np.testing.assert_array_equal(by_kernel[0], expected[0])
+        assert by_kernel[1:] == expected[1:]
+    assert found == {True, False}
 
 
 def test_a_start_on_a_singular_configuration_is_no_passage() -> None:

@@ -180,9 +180,9 @@ def test_a_chunk_that_is_given_is_kept_however_long_its_cases_take(clock: Clock)
 
 @pytest.mark.parametrize(
     ("kind", "longest", "last", "seconds"),
-    [(Executor, 32, 3, 0.5), (ProcessPoolExecutor, 3, 1, 0.05)],
+    [(Executor, 64, 6, 1.0), (ProcessPoolExecutor, 3, 1, 0.05)],
 )
-def test_chunks_take_half_a_second_with_executors_of_other_packages(
+def test_chunks_take_a_second_with_executors_of_other_packages(
     kind: type[Executor], longest: int, last: int, seconds: float
 ) -> None:
     sent: list[tuple[int, float]] = []

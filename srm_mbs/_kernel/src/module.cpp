@@ -27,6 +27,7 @@
 #include "model.hpp"
 #include "run.hpp"
 #include "separated_rows.hpp"
+#include "sigma_dips.hpp"
 #include "struct_binding.hpp"
 
 using namespace srm;
@@ -127,6 +128,7 @@ void bind_structs(nb::module_& m) {
     bind_struct<Extension>(m, "Extension");
     bind_struct<SchemeDense>(m, "SchemeDense");
     bind_struct<DenseConstants>(m, "DenseConstants");
+    bind_struct<DipSearch>(m, "DipSearch");
     bind_struct<EventConstants>(m, "EventConstants");
     bind_struct<BranchCurve>(m, "BranchCurve");
 }
@@ -1352,7 +1354,22 @@ struct PyDense {
     }
 };
 
+// Times (k,) of the samples of sigma, the dips and their tops; None if there are no dips.
+nb::object py_recorded_dips(const DipSearch& search, const Array& times, const Array& sigmas,
+                            double end) {
+    if (sigmas.ndim() != 2 || sigmas.shape(0) < 1 || times.ndim() != 1 ||
+        times.size() != sigmas.shape(0) + 1)
+        throw nb::value_error("times and sigmas have other shapes");
+    const long width = static_cast<long>(sigmas.shape(1));
+    expect_within("columns", search.columns, 0, width - 1);
+    SigmaDips found = recorded_dips(search, times.data(), sigmas.data(),
+                                    static_cast<long>(sigmas.shape(0)), width, end);
+    if (found.dips.empty()) return nb::none();
+    return nb::make_tuple(owned_array(std::move(found.t)), found.dips, found.tops);
+}
+
 void bind_dense_output(nb::module_& m) {
+    m.def("recorded_dips", &py_recorded_dips);
     bind_struct<PySteps>(m, "StepArrays");
     nb::class_<PyDense>(m, "DenseOutput")
         .def(nb::init<int, int, const std::vector<SchemeDense>&, const DenseConstants&,

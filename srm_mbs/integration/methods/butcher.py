@@ -291,11 +291,6 @@ class ButcherTableau(_Record):
         return order[np.diff(self.abscissae[order], prepend=0.0) > SAME_STAGE]
 
     @cached_property
-    def intervals(self) -> FloatArray:
-        """Lengths of the intervals from 0 to the first of ``distinct`` and between them."""
-        return np.diff(self.abscissae[self.distinct], prepend=0.0)
-
-    @cached_property
     def gaps(self) -> tuple[tuple[float, float], ...]:
         """(centre, half width) of the gaps between 0, the abscissae and 1, the widest first."""
         nodes = sorted({0.0, 1.0, *(x for x in self.c.tolist() if 0.0 < x < 1.0)})

@@ -31,12 +31,11 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.integration.driver import Closures
 from srm_mbs.integration.kernel import backend as kernel
-from srm_mbs.integration.kernel import marshalling
-from srm_mbs.integration.methods import psrm
+from srm_mbs.integration.kernel import marshalling, run
+from srm_mbs.integration.methods import near_singular, psrm, split_step
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.split_step import later_stages
 from srm_mbs.simulation import runner
-from srm_mbs.simulation.options import step_size_control
 
 CASES = (
     ("four_bar", 6.0),
@@ -114,9 +113,10 @@ class PlainStep:
 def nothing_for_singular_configurations() -> Iterator[None]:
     """``simulate`` with no placement, guard, watch, look at the start and look for bifurcations."""
 
+    placed_control = runner.placed_control
+
     def control(system: Any, options: Any, first_step: Callable[[], float], *_: Any) -> Any:
-        span = options.t0, options.t_end
-        return step_size_control(options.method.scheme, *span, options.step, first_step), ()
+        return placed_control(system, options._replace(placement="off"), first_step)
 
     def start(
         system: Any, method: Any, t: float, state: Any, norm: Any, *_: Any
@@ -133,15 +133,17 @@ def nothing_for_singular_configurations() -> Iterator[None]:
         yield
 
 
-NEVER = {"watched": -1.0, "far": 0.0, "gap_every": -(2**31 - 1)}
-"""Constants of the kernel with which no step is looked at."""
-
-
 @contextmanager
 def nothing_on_the_kernel() -> Iterator[None]:
     """The same for the kernel, together with ``placement="off"``."""
     with (
-        patch.dict(marshalling.CONSTANTS, NEVER),
+        patch.object(near_singular, "WATCHED_SIGMA", -1.0),
+        patch.object(near_singular, "FAR_STEPS", 0.0),
+        patch.object(split_step, "RESIDUAL_EVERY", -(2**31 - 1)),
+    ):
+        never = marshalling.constants()
+    with (
+        patch.object(run, "CONSTANTS", never),
         patch.object(runner, "bifurcation_sentences", lambda _: ""),
     ):
         yield
@@ -172,7 +174,7 @@ def measure(backend: str, name: str, t_end: float, tableau: str, tol: float, rep
     nothing = {"python": nothing_for_singular_configurations, "kernel": nothing_on_the_kernel}
     off = {"python": "automatic", "kernel": "off"}
 
-    def run(everything: bool) -> tuple[float, srm.Solution]:
+    def timed(everything: bool) -> tuple[float, srm.Solution]:
         with nullcontext() if everything else nothing[backend]():
             start = time.process_time()
             solution = srm.simulate(
@@ -185,14 +187,14 @@ def measure(backend: str, name: str, t_end: float, tableau: str, tol: float, rep
             )
             return time.process_time() - start, solution
 
-    both = [run(everything)[1] for everything in (True, False)]
+    both = [timed(everything)[1] for everything in (True, False)]
     evaluations = [solution.stats.evaluations for solution in both]
     if evaluations[0] != evaluations[1] or not np.array_equal(both[0].q, both[1].q):
         raise SystemExit(f"{name}, {tableau}: the runs differ, evaluations {evaluations}")
     times: dict[bool, list[float]] = {True: [], False: []}
     for k in range(repeats):
         for everything in (True, False) if k % 2 else (False, True):
-            times[everything].append(run(everything)[0])
+            times[everything].append(timed(everything)[0])
     ratios = [a / b for a, b in zip(times[True], times[False])]
     low, middle, high = statistics.quantiles(ratios, n=4)
     return Row(

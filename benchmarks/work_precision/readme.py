@@ -42,7 +42,10 @@ def _triple(entries: Sequence[Best | None]) -> str:
 
 
 def _ratio(theirs: Best | None, ours: Best | None) -> str:
-    return f"{theirs.seconds / ours.seconds:.2g}" if theirs and ours else "-"
+    if not (theirs and ours):
+        return "-"
+    ratio = theirs.seconds / ours.seconds
+    return f"{ratio:.2g}" if ratio < 99.5 else f"{ratio:.0f}"
 
 
 def _measured(results: Results, problems: Sequence[str]) -> list[str]:

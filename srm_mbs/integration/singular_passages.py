@@ -458,7 +458,7 @@ def _recorded(scheme: ButcherTableau, steps: StepData) -> tuple[FloatArray, Floa
 
 
 def _of_stages(scheme: ButcherTableau, steps: StepData) -> tuple[FloatArray, FloatArray]:
-    """Those of whole steps."""
+    """The same to the end of the last step, which an event may have cut."""
     h = np.diff(steps.times)
     if not np.logical_or.reduce(steps.stiff):  # stages in the same order in all steps
         own = scheme.member(False)
@@ -533,7 +533,8 @@ def recorded_dips(scheme: ButcherTableau, steps: StepData) -> RecordedDips | Non
 
 
 def _dips(t: FloatArray, sigma: FloatArray, around: int) -> RecordedDips | None:
-    """The same of samples ``sigma`` (k,) at t (k,)."""
+    """As :func:`recorded_dips`, of samples ``sigma`` (k,) at t (k,); each is compared with those
+    within ``around`` samples."""
     if len(t) < 3 or not np.isfinite(sigma).all():
         return None
     lowest = _lowest(t, sigma, around)

@@ -28,6 +28,27 @@ inline void add(double a, const double* x, double* y, int n) {
     for (int i = 0; i < n; ++i) y[i] += a * x[i];
 }
 
+// out = h sum_k a_k rows_k over the first `count` rows (n,).  Four components at a time stay in
+// registers over all rows; each is summed in the order of k.
+inline void combine(double h, const double* a, int count, const double* rows, int n, double* out) {
+    int i = 0;
+    for (; i + 4 <= n; i += 4) {
+        double s[4] = {0.0, 0.0, 0.0, 0.0};
+        for (int k = 0; k < count; ++k) {
+            if (a[k] == 0.0) continue;
+            const double by = h * a[k], *row = rows + k * n + i;
+            for (int j = 0; j < 4; ++j) s[j] += by * row[j];
+        }
+        std::copy_n(s, 4, out + i);
+    }
+    for (; i < n; ++i) {
+        double s = 0.0;
+        for (int k = 0; k < count; ++k)
+            if (a[k] != 0.0) s += h * a[k] * rows[k * n + i];
+        out[i] = s;
+    }
+}
+
 inline double norm(const double* a, int n) {
     return std::sqrt(dot(a, a, n));
 }

@@ -26,7 +26,6 @@
 #include "linear.hpp"
 #include "manifold.hpp"
 #include "model.hpp"
-#include "processor.hpp"
 #include "run.hpp"
 #include "separated_rows.hpp"
 #include "sigma_dips.hpp"
@@ -59,16 +58,9 @@ std::vector<double> optional_vector(nb::handle object) {
     return object.is_none() ? std::vector<double>{} : to_vector(object);
 }
 
-// h times the sum (n,) of the rows (count, n) with these weights (count,).
-SRM_FOR_PROCESSOR
-void weighted_sum(const double* weights, std::size_t count, double h, const double* rows,
-                  std::size_t n, double* __restrict__ out) {
-    std::fill_n(out, n, 0.0);
-    for (std::size_t j = 0; j < count; ++j, rows += n) {
-        const double weight = h * weights[j];
-        if (weight == 0.0) continue;
-        for (std::size_t k = 0; k < n; ++k) out[k] += weight * rows[k];
-    }
+// Raises `largest` to a larger value, and to NaN, than which nothing is larger.
+void take_largest(double value, double& largest) {
+    if (value > largest || std::isnan(value)) largest = value;
 }
 
 // A view of `values`, which `owner` keeps alive.
@@ -260,10 +252,7 @@ struct PySystem {
         system->closure_errors(t, state.data(), g.data(), rates.data());
         const auto largest = [&](const std::vector<double>& errors) {
             double out = 0.0;
-            for (int i = 0; i < rows; ++i) {
-                const double error = std::abs(errors[i]) / over[i];
-                if (error > out || std::isnan(error)) out = error;  // nothing is larger than NaN
-            }
+            for (int i = 0; i < rows; ++i) take_largest(std::abs(errors[i]) / over[i], out);
             return out;
         };
         return nb::make_tuple(largest(g), largest(rates));
@@ -490,7 +479,8 @@ struct PySystem {
             const double h = times.data()[step + 1] - times.data()[step];
             const double* const own = rates.data() + step * width * n;
             for (std::size_t i = 0; i < stages; ++i) {
-                weighted_sum(A.data() + i * s, s, h, own, n, moved.data());
+                combine(h, A.data() + i * s, static_cast<int>(s), own, static_cast<int>(n),
+                        moved.data());
                 system->retract(states.data() + step * nx, moved.data(), &x[i * nx]);
                 t[i] = times.data()[step] + h * c.data()[i];
             }
@@ -1295,18 +1285,15 @@ nb::tuple largest_entries(const Array& x, const Array& unit, const std::vector<i
     expect_within("order", order, 0, static_cast<int>(width) - 1);
     expect_within("starts", starts, 0, static_cast<int>(width) - 1);
     std::vector<double> size(2 * n), norms(groups);
-    const auto take = [](double value, double& largest) {  // nothing is larger than NaN
-        if (value > largest || std::isnan(value)) largest = value;
-    };
     const double* row = x.data();
     for (std::size_t i = 0; i < n; ++i, row += width) {
         for (std::size_t k = 0; k < width; ++k)
-            take(std::abs(row[k] / unit.data()[k]), size[2 * i + (2 * k >= width)]);
+            take_largest(std::abs(row[k] / unit.data()[k]), size[2 * i + (2 * k >= width)]);
         for (std::size_t g = 0; g < groups; ++g) {
             const std::size_t end = g + 1 < groups ? starts[g + 1] : width;
             double square = 0.0;
             for (std::size_t k = starts[g]; k < end; ++k) square += row[order[k]] * row[order[k]];
-            take(square, norms[g]);
+            take_largest(square, norms[g]);
         }
     }
     for (double& norm : norms) norm = std::sqrt(norm);

@@ -76,7 +76,7 @@ struct ZoneRecord {
 // The accepted steps, one after the other.
 struct StepRecords {
     std::vector<double> times, states, rates, corrections, sigmas, ranks, error_ratios;
-    std::vector<double> placements;  // 0: none, 1: placed, 2: redone, critical
+    std::vector<double> placements;  // 0: none, 1: placed, 2: redone, or critical
     std::vector<double> stiff;       // 1: the problem had been found to be stiff
     std::vector<double> held;        // 1: a stage kept the normals of the last node
     std::vector<double> breaks;      // numbers of the steps before breakpoints

@@ -10,31 +10,6 @@
 
 namespace srm {
 
-namespace {
-
-// out = h sum_k a_k rates_k over the first `count` rates (n,).  Four components at a time stay in
-// registers over all rates; each is summed in the order of k.
-void combine(double h, const double* a, int count, const double* rates, int n, double* out) {
-    int i = 0;
-    for (; i + 4 <= n; i += 4) {
-        double s[4] = {0.0, 0.0, 0.0, 0.0};
-        for (int k = 0; k < count; ++k) {
-            if (a[k] == 0.0) continue;
-            const double by = h * a[k], *rate = rates + k * n + i;
-            for (int j = 0; j < 4; ++j) s[j] += by * rate[j];
-        }
-        std::copy_n(s, 4, out + i);
-    }
-    for (; i < n; ++i) {
-        double s = 0.0;
-        for (int k = 0; k < count; ++k)
-            if (a[k] != 0.0) s += h * a[k] * rates[k * n + i];
-        out[i] = s;
-    }
-}
-
-}  // namespace
-
 void ButcherTableau::check() const {
     const std::size_t s = b.size();
     if (s == 0) throw std::invalid_argument("b is empty");

@@ -93,7 +93,4 @@ def even_times(solution: SimulationResult) -> FloatArray:
     count = EVEN_TIMES
     if len(solution.scheme.dense.extra_c):
         count = min(count, max(FEWEST_EVEN_TIMES, solution.steps.count // 5))
-    start, end = solution.span
-    times = np.arange(count, dtype=float) * ((end - start) / (count - 1)) + start
-    times[-1] = end
-    return times
+    return np.linspace(*solution.span, count)

@@ -32,7 +32,11 @@ from srm_mbs.dynamics.constraints.row_algebra import (
 )
 from srm_mbs.dynamics.constraints.structure import SMALL_REFERENCE_PIVOT
 from srm_mbs.dynamics.singularities.branches import branch_tangents
-from srm_mbs.dynamics.singularities.critical import CriticalConfiguration, critical_configuration
+from srm_mbs.dynamics.singularities.critical import (
+    CriticalConfiguration,
+    critical_configuration,
+    first_step_length,
+)
 from srm_mbs.dynamics.singularities.local_analysis import (
     Participants,
     SingularConfiguration,
@@ -87,6 +91,8 @@ beyond the accuracy of the run."""
 CROSSING_SEARCH = 0.3
 """Distance (rad, scene diagonals) from the dense output within which the singular configuration of
 a crossing is looked for."""
+BEYOND_REACH = 1.25
+"""First step of that search, over its reach and the motion around, from which nothing is there."""
 LEAST_SIGNED = 1e-8
 """Value over those at the sides at which the zero of a value with a sign is found."""
 SIGNED_DECREASE = 0.5
@@ -178,6 +184,18 @@ class ConstraintMonitor:
             CROSSING_SEARCH,
             jacobians=self._jacobians_at,
         )
+
+    def is_regular(self, t: float, around: Sequence[float]) -> bool:
+        """Whether the search for a critical configuration next to the motion at t (s) leaves its
+        reach at once, and would from the places at the times ``around`` it as well."""
+        geometry, reach = self.geometry, CROSSING_SEARCH
+        q, *others = (
+            geometry.at(q, time)
+            for time, (q, _) in zip((t, *around), self.states(np.array([t, *around])))
+        )
+        reach += max(float(np.abs(geometry.difference(q, other)).max()) for other in others)
+        step = first_step_length(geometry, self.rank, q, self._jacobians_at)
+        return step > BEYOND_REACH * reach
 
     def _jacobians_at(self, places: FloatArray) -> FloatArray:
         """As of the geometry, in one call of the observables."""
@@ -667,10 +685,12 @@ def _crossings_along_curves(monitor: ConstraintMonitor, steps: StepData) -> list
     for first, last in steps.critical_ranges:
         lowest = first + int(np.argmin(steps.sigmas[first:last, -1]))
         time = float(steps.times[lowest + 1])
+        before, after = steps.times[lowest], steps.times[min(lowest + 2, steps.count)]
+        if monitor.is_regular(time, (before, after)):
+            continue
         critical = monitor.critical(time)
         if critical is None:
             # The steps around it may have their ends too far from it to lead there.
-            before, after = steps.times[lowest], steps.times[min(lowest + 2, steps.count)]
             time = _closest(monitor, np.linspace(before, after, SAMPLES))
             critical = monitor.critical(time)
         if critical is None:

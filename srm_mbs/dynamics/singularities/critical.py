@@ -258,6 +258,33 @@ def critical_configuration(
     return found if best < ACCEPTED else None
 
 
+def first_step_length(
+    geometry: ClosureGeometry, structural_rank: int, q: FloatArray, jacobians: Jacobians
+) -> float:
+    """Largest motion of a coordinate (units) in the first step of :func:`critical_configuration`
+    from a closed configuration q (nq,).
+
+    It takes few derivatives.  With u the last left singular vector of the normalised G and
+    G^T u = sigma v, a step that keeps the other combinations closed and the length of u lies in the
+    span of v and the null space of G, and H dq = -sigma v there.
+
+    Parameters
+    ----------
+    structural_rank, jacobians
+        As for :func:`critical_configuration`.
+    """
+    size = geometry.row_size
+    G = jacobians(q[None])[0]
+    left, values, right = np.linalg.svd(G / size[:, None])
+    weights = left[:, structural_rank - 1] / size
+    span = right[structural_rank - 1 :]
+    places = np.array([geometry.move(q, DIFFERENCE * along) for along in span])
+    changes = (weights @ jacobians(places) - weights @ G) / DIFFERENCE
+    matrix, value = span @ changes.T + RIDGE * np.eye(len(span)), np.zeros(len(span))
+    value[0] = -values[structural_rank - 1]
+    return float(np.abs(np.linalg.solve(matrix, value) @ span).max())
+
+
 class CurveThroughSaddle:
     """The closed configurations next to a critical one of a mechanism with one degree of freedom.
 

@@ -12,7 +12,11 @@ import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, column_groups
 from srm_mbs.dynamics.constraints.structure import structure_of
-from srm_mbs.dynamics.singularities.critical import CriticalConfiguration, critical_configuration
+from srm_mbs.dynamics.singularities.critical import (
+    CriticalConfiguration,
+    critical_configuration,
+    first_step_length,
+)
 from tests.support.bundled import load
 
 TURN = 2.0 * np.pi
@@ -88,6 +92,20 @@ def test_whole_turns_lead_elsewhere_where_closures_count_them() -> None:
     assert known.in_turns_of(one_turn) is None
     found = search(geometry, one_turn + 0.05, 0.6, known)
     np.testing.assert_allclose(found.q, one_turn, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["klann_walker", "slider_crank", "delta_robot"])
+def test_the_search_leaves_a_reach_that_is_shorter_than_its_first_step_at_once(name: str) -> None:
+    mechanism = load(name)
+    geometry, q = Counting(mechanism, mechanism.q0), mechanism.q0
+    length = first_step_length(geometry, mechanism.structure.rank, q, geometry.jacobians)
+    counts = []
+    for reach in (0.99 * length, 1.01 * length):
+        geometry.evaluations = 0
+        found = search(geometry, q, reach)
+        counts.append(geometry.evaluations)
+        assert found is None or reach > length
+    assert counts[0] < counts[1]
 
 
 @pytest.mark.parametrize("name", ["n_four_bar_20", "delta_robot", "jansen_walker", "differential"])

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -25,6 +26,9 @@ from srm_mbs.model.mechanism import MechanismData, per_model
 
 LINEAR = (SpringDamper, TorsionSpring, Bushing)
 """Elements whose force is that of a stiffness and that of a damping."""
+
+
+NO_ANGLES = np.zeros((0, 0))
 
 
 def without_spring(force: ForceElement) -> ForceElement:
@@ -143,21 +147,40 @@ class Observables:
         pairs = zip(states, motions)
         return np.array([self.system.retract(*pair) for pair in pairs]).reshape(states.shape)
 
-    @staticmethod
-    def largest_entries(
-        x: FloatArray, unit: FloatArray, order: list[int], starts: list[int]
-    ) -> tuple[FloatArray, FloatArray]:
-        """Of motions and changes of the rates x (n, 2 nv) the largest of either over its ``unit``
-        (2 nv,), as (n, 2), and the largest norm (m,) at any time of each group of entries.
+    def largest_differences(
+        self,
+        a: FloatArray,
+        b: FloatArray,
+        unit: FloatArray,
+        order: list[int],
+        starts: list[int],
+        turned: Sequence[int] = (),
+        angles: FloatArray = NO_ANGLES,
+    ) -> tuple[FloatArray, list[float]]:
+        """Of the :meth:`differences` of states, a (n, nx), or (1, nx) for all of them, and b
+        (n, nx): the largest of either over its ``unit`` (2 nv,), as (n, 2), and the largest norm
+        at any time of each of m groups of entries.
 
         Parameters
         ----------
         order, starts
-            Indices (2 nv,) of the entries, one group after the other, and where the m groups begin.
+            Indices of the entries, one group after the other, and where the m groups begin.
+        turned, angles
+            Coordinates that move by other angles (n, k) rad: with the whole turns of joints that
+            are stored as cosine and sine.
         """
+        x = self.differences(np.broadcast_to(a, b.shape), b)
+        x[:, turned] = angles.reshape(len(x), -1)
         size = np.maximum.reduceat(np.abs(x / unit), [0, len(unit) // 2], axis=1)
+        return size, self.largest_norms(x, order, starts)
+
+    @staticmethod
+    def largest_norms(x: FloatArray, order: list[int], starts: list[int]) -> list[float]:
+        """The largest norm in any row of x (n, k) of each group of entries, as in
+        :meth:`largest_differences`."""
         squares = np.add.reduceat(x[:, order] ** 2, starts, axis=1)
-        return size, np.sqrt(squares.max(axis=0, initial=0.0))
+        out: list[float] = np.sqrt(squares.max(axis=0, initial=0.0)).tolist()
+        return out
 
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         """Kinetic and potential energy (n, 2) J: of the bodies; of gravity, springs and

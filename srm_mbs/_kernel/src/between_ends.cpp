@@ -10,9 +10,10 @@ namespace srm {
 
 namespace {
 
-// Ends around a step through which polynomials lead.  In steps of the loosest reruns of the bundled
-// mechanisms fewer are less often accurate enough, which costs evaluations.
-constexpr int most_ends = 16;
+// Numbers of ends around a step through which polynomials lead: few first, and the most of them where
+// those are not accurate enough.  In steps of the loosest reruns of the bundled mechanisms they often
+// are not, and more than the most seldom save the evaluations that remain.
+constexpr int few_ends = 10, most_ends = 16;
 // Of an end of a step the state and the rates of its coordinates (nx,), and their weights in the
 // polynomial, and in its difference from the one through fewer ends.
 struct WeightedEnd {
@@ -47,10 +48,21 @@ void DenseOutput::between_ends(System& system, const double* t, long k, const do
         const long step = step_at(t[i]);
         const double theta = (t[i] - steps_.times[step]) /
                              (steps_.times[step + 1] - steps_.times[step]);
-        if (ends.step != step) take_ends(system, step, rates, ends);
-        if (!through_ends(system, ends, theta, of_coordinates.data(), out))
+        if (ends.step != step) take_ends(step, ends);
+        if (!near_ends(system, theta, of_coordinates.data(), rates, ends, out))
             states(system, t + i, 1, out);
     }
+}
+
+// The state by the fewest ends that are accurate enough; false if none are.
+bool DenseOutput::near_ends(const System& system, double theta, const double* allowed,
+                            EndRates& rates, EndNodes& ends, double* out) {
+    if (!ends.count) use_ends(system, std::min(few_ends, ends.all), rates, ends);
+    while (!through_ends(system, ends, theta, allowed, out)) {
+        if (ends.count == ends.all) return false;
+        use_ends(system, ends.all, rates, ends);
+    }
+    return true;
 }
 
 // Rates of the coordinates at an end of a step of the smooth interval that ends at `last`: each of
@@ -60,7 +72,7 @@ const double* DenseOutput::coordinate_rate(const System& system, long node, long
     if (last != rates.last) {  // of a breakpoint, the rates on the other side
         rates.last = last;
         rates.known.assign(static_cast<std::size_t>(steps_.count) + 1, 0);
-        rates.rates.resize(rates.known.size() * nx_);
+        if (!rates.rates) rates.rates.reset(new double[rates.known.size() * nx_]);
     }
     double* const rate = &rates.rates[static_cast<std::size_t>(node) * nx_];
     if (!rates.known[node]) {
@@ -70,45 +82,53 @@ const double* DenseOutput::coordinate_rate(const System& system, long node, long
     return rate;
 }
 
-// The ends around a step, and the polynomials through them; none where there are not enough.
-void DenseOutput::take_ends(const System& system, long step, EndRates& rates,
-                            EndNodes& ends) const {
+// The ends around a step, none of which is in use.
+void DenseOutput::take_ends(long step, EndNodes& ends) const {
     ends.step = step;
-    ends.count = 0;
+    ends.all = ends.count = 0;
     const Nodes nodes = nodes_away(nullptr, step, most_ends);
     const int count = nodes.count;
     if (count < constants_.nodes[2]) return;
-    ends.count = count;
-    const double* const times = steps_.times;
-    const double h = times[step + 1] - times[step];
-    const long last = smooth_interval(step).second;
+    ends.all = count;
     // In order of their distance from the middle of the step.
-    const double middle = 0.5 * (times[step] + times[step + 1]);
+    const double *const times = steps_.times, middle = 0.5 * (times[step] + times[step + 1]);
     int after = 0;
     while (after < count && times[nodes.at[after]] <= middle) ++after;
-    double products[most_nodes];
     for (int i = 0, before = after; i < count; ++i) {
         const bool left = after == count || (before > 0 && middle - times[nodes.at[before - 1]] <=
                                                                times[nodes.at[after]] - middle);
-        const long node = nodes.at[left ? --before : after++];
+        ends.nodes[i] = nodes.at[left ? --before : after++];
+    }
+}
+
+// Takes further ends of the step into use, up to `count`.
+void DenseOutput::use_ends(const System& system, int count, EndRates& rates,
+                           EndNodes& ends) const {
+    const double* const times = steps_.times;
+    const long step = ends.step, last = smooth_interval(step).second;
+    const double h = times[step + 1] - times[step];
+    // The furthest one of those in use before was not yet in both polynomials.
+    for (int i = std::max(ends.count - 1, 0); i < count; ++i) {
+        const long node = ends.nodes[i];
         ends.states[i] = steps_.states + node * nx_;
         ends.rates[i] = coordinate_rate(system, node, last, rates);
         ends.points[i] = (times[node] - times[step]) / h;
-        products[i] = 1.0;
-        ends.slopes[i] = 0.0;
-        if (i == count - 1) break;  // the last one is not in both
+        if (i == count - 1) break;
+        double product = 1.0, slope = 0.0;
         for (int j = 0; j < i; ++j) {
             const double apart = ends.points[i] - ends.points[j], inverse = 1.0 / apart;
-            products[i] *= apart;
-            products[j] *= -apart;
-            ends.slopes[i] += inverse;
+            product *= apart;
+            ends.products[j] *= -apart;
+            slope += inverse;
             ends.slopes[j] -= inverse;
         }
+        ends.products[i] = product;
+        ends.slopes[i] = slope;
     }
-    for (int i = 0; i < count - 1; ++i) ends.weights[i] = 1.0 / products[i];
+    ends.count = count;
 }
 
-// Hermite's polynomial through all of the ends; false if that through one less differs by more than
+// Hermite's polynomial through the ends in use; false if that through one less differs by more than
 // what is allowed.
 bool DenseOutput::through_ends(const System& system, const EndNodes& ends, double theta,
                                const double* allowed, double* out) {
@@ -137,7 +157,7 @@ bool DenseOutput::through_ends(const System& system, const EndNodes& ends, doubl
     double product_there = 1.0, slope_there = 0.0;  // at the furthest
     for (int i = less; i-- > 0;) {
         const double apart = ends.points[i] - furthest, inverse = 1.0 / apart;
-        const double fewer = ends.weights[i] * before[i] * after;
+        const double fewer = before[i] * after / ends.products[i];
         after *= theta - ends.points[i];
         product_there *= -apart;
         slope_there -= inverse;

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <limits>
+#include <memory>
 #include <utility>
 #include <vector>
 
@@ -85,21 +86,26 @@ private:
     struct EndRates {
         long last = -1;
         std::vector<char> known;
-        std::vector<double> rates;
+        std::unique_ptr<double[]> rates;  // written where they are known
     };
-    // Ends around a step in order of their distance, the states there and the rates of their
-    // coordinates, and of Hermite's polynomial through all of them but the furthest the weights of
-    // Lagrange's basis and its slope at each.
+    // Ends around a step in order of their distance, 0 if there are not enough; of the first `count`
+    // of them, in use, the states and the rates of their coordinates, and of Hermite's polynomial
+    // through these but the furthest the products of distances of each from the others, whose
+    // inverses are the weights of Lagrange's basis, and its slope there.
     struct EndNodes {
         long step = -1;
-        int count = 0;  // 0: not enough of them
+        int all = 0, count = 0;
+        long nodes[most_nodes];
         const double *states[most_nodes], *rates[most_nodes];
-        double points[most_nodes], weights[most_nodes], slopes[most_nodes];
+        double points[most_nodes], products[most_nodes], slopes[most_nodes];
     };
     long step_at(double t) const;
     const double* coordinate_rate(const System& system, long node, long last,
                                   EndRates& rates) const;
-    void take_ends(const System& system, long step, EndRates& rates, EndNodes& ends) const;
+    void take_ends(long step, EndNodes& ends) const;
+    void use_ends(const System& system, int count, EndRates& rates, EndNodes& ends) const;
+    bool near_ends(const System& system, double theta, const double* allowed, EndRates& rates,
+                   EndNodes& ends, double* out);
     bool through_ends(const System& system, const EndNodes& ends, double theta,
                       const double* allowed, double* out);
     struct Nodes {

@@ -270,6 +270,20 @@ void ForceElement::check() const {
     if (curves.size() > 1) expect_size("curves", curves.size(), numbers.size());
 }
 
+void check_indices(const ForceElement& e, long nq, long nv, long joints) {
+    for (const Anchor* anchor : {&e.a, &e.b})
+        expect_within("Anchor.joint", anchor->joint, 0, joints - 1);
+    expect_within("ForceElement.columns", e.columns, 0, nv - 1);
+    expect_within("ForceElement.positions", e.positions, 0, nq - 1);
+    const bool torque = e.kind == ForceKind::joint_torque;
+    const bool on_joint =
+        torque || e.kind == ForceKind::torsion_spring || e.kind == ForceKind::limit_spring;
+    if (!on_joint) return;
+    expect_within("ForceElement.in_v", e.in_v, 0,
+                  nv - (torque ? static_cast<long>(e.numbers.size()) : 1));
+    if (!torque) expect_within("ForceElement.in_q", e.in_q, 0, nq - 1);
+}
+
 bool acts_on_several(const ForceElement& e) {
     return e.kind == ForceKind::spring_damper || e.kind == ForceKind::wrench ||
            e.kind == ForceKind::bushing || e.kind == ForceKind::coupling_spring;

@@ -60,6 +60,9 @@ struct ForceElement {
     void check() const;
 };
 
+// Throws std::invalid_argument for coordinates and joints that a model with so many does not have.
+void check_indices(const ForceElement& element, long nq, long nv, long joints);
+
 // Whether an element acts at points of links or on several joints, not on the coordinate of one.
 bool acts_on_several(const ForceElement& element);
 

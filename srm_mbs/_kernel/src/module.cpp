@@ -63,9 +63,39 @@ void take_largest(double value, double& largest) {
     if (value > largest || std::isnan(value)) largest = value;
 }
 
+// The largest norm (m,) in any row of `width` numbers of each of the groups order[starts[i]], ...,
+// order[starts[i + 1] - 1] of its entries.
+class LargestNorms {
+public:
+    LargestNorms(const std::vector<int>& order, const std::vector<int>& starts, std::size_t width)
+        : order_(order), starts_(starts), squares_(starts.size()) {
+        expect_within("order", order, 0, static_cast<long>(width) - 1);
+        expect_within("starts", starts, 0, static_cast<long>(order.size()) - 1);
+    }
+
+    void take(const double* row) {
+        for (std::size_t g = 0; g < starts_.size(); ++g) {
+            const std::size_t end = g + 1 < starts_.size() ? starts_[g + 1] : order_.size();
+            double square = 0.0;
+            for (std::size_t k = starts_[g]; k < end; ++k) square += row[order_[k]] * row[order_[k]];
+            take_largest(square, squares_[g]);
+        }
+    }
+
+    std::vector<double> norms() const {
+        std::vector<double> out;
+        for (const double square : squares_) out.push_back(std::sqrt(square));
+        return out;
+    }
+
+private:
+    const std::vector<int>&order_, &starts_;
+    std::vector<double> squares_;
+};
+
 // A view of `values`, which `owner` keeps alive.
-nb::object view(const std::vector<double>& values, std::initializer_list<std::size_t> shape,
-                nb::handle owner) {
+template <typename Values>
+nb::object view(const Values& values, std::initializer_list<std::size_t> shape, nb::handle owner) {
     return nb::cast(nb::ndarray<nb::numpy, double>(const_cast<double*>(values.data()), shape.size(),
                                                    shape.begin(), owner));
 }
@@ -409,17 +439,30 @@ struct PySystem {
         return owned_array(std::move(out));
     }
 
-    // Motions (n, 2 nv) from one to another of each two states (n, nx), in the chart of the first.
-    nb::object differences(const Array& from, const Array& to) {
-        const std::size_t nx = state_size(), n = from.size() / nx;
-        if (from.ndim() != 2 || from.shape(1) != nx || to.size() != from.size())
-            throw nb::value_error("states has another shape");
-        const auto width = 2 * static_cast<std::size_t>(system->nv);
-        std::vector<double> out(n * width), none(system->nv, 0.0);
-        for (std::size_t i = 0; i < n; ++i)
-            system->difference(from.data() + i * nx, to.data() + i * nx, none.data(),
-                               out.data() + i * width);
-        return owned_array(std::move(out), {n, width});
+    // Of the motions and changes of the rates between each two states, from (n, nx), or (1, nx) for
+    // all of them, and to (n, nx): the largest entry of either over its unit (n, 2), and the largest
+    // norms of groups of entries (LargestNorms).  The coordinates `turned` (k,) move by `angles`
+    // (n, k).
+    nb::tuple largest_differences(const Array& from, const Array& to, const Array& unit,
+                                  const std::vector<int>& order, const std::vector<int>& starts,
+                                  const std::vector<int>& turned, const Array& angles) {
+        const std::size_t nx = state_size(), n = to.size() / nx, own = from.size() / nx;
+        const auto width = 2 * static_cast<std::size_t>(system->nv), k = turned.size();
+        if (from.ndim() != 2 || from.shape(1) != nx || to.ndim() != 2 || to.shape(1) != nx ||
+            (own != n && own != 1) || unit.size() != width || angles.size() != n * k)
+            throw nb::value_error("states, unit or angles has another shape");
+        expect_within("turned", turned, 0, system->nv - 1);
+        LargestNorms norms(order, starts, width);
+        std::vector<double> size(2 * n), row(width), none(system->nv, 0.0);
+        for (std::size_t i = 0; i < n; ++i) {
+            system->difference(from.data() + (own == n ? i : 0) * nx, to.data() + i * nx,
+                               none.data(), row.data());
+            for (std::size_t j = 0; j < k; ++j) row[turned[j]] = angles.data()[i * k + j];
+            for (std::size_t j = 0; j < width; ++j)
+                take_largest(std::abs(row[j] / unit.data()[j]), size[2 * i + (2 * j >= width)]);
+            norms.take(row.data());
+        }
+        return nb::make_tuple(owned_array(std::move(size), {n, 2}), norms.norms());
     }
 
     // Each of the states (n, nx) moved by one of the motions (n, 2 nv), in its own chart.
@@ -470,23 +513,13 @@ struct PySystem {
         if (rates.ndim() != 3 || rates.shape(0) + 1 != ends || rates.shape(2) != n || !stages ||
             A.size() % stages != 0 || A.size() / stages > rates.shape(1))
             throw nb::value_error("rates or A has another shape");
-        const std::size_t s = A.size() / stages, width = rates.shape(1);
-        const SeparateElements each = system->separate(elements);
-        std::vector<double> out(chosen.size() * stages * m), t(stages), x(stages * nx), moved(n);
-        double* powers = out.data();
-        for (const long step : chosen) {
+        for (const long step : chosen)
             expect_within("chosen", step, 0, static_cast<long>(ends) - 2);
-            const double h = times.data()[step + 1] - times.data()[step];
-            const double* const own = rates.data() + step * width * n;
-            for (std::size_t i = 0; i < stages; ++i) {
-                combine(h, A.data() + i * s, static_cast<int>(s), own, static_cast<int>(n),
-                        moved.data());
-                system->retract(states.data() + step * nx, moved.data(), &x[i * nx]);
-                t[i] = times.data()[step] + h * c.data()[i];
-            }
-            system->powers(t.data(), x.data(), stages, each, false, powers);
-            powers += stages * m;
-        }
+        std::vector<double> out(chosen.size() * stages * m);
+        system->stage_powers(chosen,
+                             {times.data(), states.data(), rates.data(), A.data(), c.data(),
+                              rates.shape(1), A.size() / stages, stages},
+                             system->separate(elements), out.data());
         return owned_array(std::move(out), {chosen.size(), stages, m});
     }
 
@@ -629,7 +662,9 @@ void bind_system(nb::module_& m) {
              nb::arg("kept"), nb::arg("t"), nb::arg("states"))
         .def("accelerations", &PySystem::accelerations, nb::arg("t"), nb::arg("states"))
         .def("smallest_values", &PySystem::smallest_values)
-        .def("differences", &PySystem::differences, nb::arg("from"), nb::arg("to"))
+        .def("largest_differences", &PySystem::largest_differences, nb::arg("from"), nb::arg("to"),
+             nb::arg("unit"), nb::arg("order"), nb::arg("starts"), nb::arg("turned"),
+             nb::arg("angles"))
         .def("moved", &PySystem::moved, nb::arg("states"), nb::arg("motions"))
         .def("energies", &PySystem::energies)
         .def("stage_powers", &PySystem::stage_powers, nb::arg("chosen"), nb::arg("times"),
@@ -1155,14 +1190,13 @@ void bind_run(nb::module_& m) {
 
     // Arrays of (steps + 1), (steps,) or (breaks,) rows.
     nb::class_<PyRecords> records(m, "StepRecords");
-    const auto array = [&records](const char* name, std::vector<double> StepRecords::*values,
-                                  auto columns) {
+    const auto array = [&records](const char* name, auto values, auto columns) {
         records.def_prop_ro(name, [values, columns](nb::handle self) {
             const PyRecords& r = *nb::inst_ptr<PyRecords>(self);
             return columns(r, r.records.*values, self);
         });
     };
-    const auto flat = [](const PyRecords&, const std::vector<double>& values, nb::handle self) {
+    const auto flat = [](const PyRecords&, const auto& values, nb::handle self) {
         return view(values, {values.size()}, self);
     };
     // Of `size` columns each, also without rows.
@@ -1175,7 +1209,7 @@ void bind_run(nb::module_& m) {
     array("times", &StepRecords::times, flat);
     array("states", &StepRecords::states, matrix(&PyRecords::nx, true));
     array("rates", &StepRecords::rates,
-          [](const PyRecords& r, const std::vector<double>& values, nb::handle self) {
+          [](const PyRecords& r, const auto& values, nb::handle self) {
               return view(values, {r.records.ranks.size(), r.stages, r.n}, self);
           });
     array("corrections", &StepRecords::corrections, matrix(&PyRecords::corrected, false));
@@ -1275,29 +1309,13 @@ void bind_run(nb::module_& m) {
         .def_prop_ro("replaced", [](const PyRun& r) { return r.run->control->replaced; });
 }
 
-// Of the rows of x (n, 2 nv) the largest entry of either half over its unit (n, 2), and the largest
-// norm (m,) in any row of each group of entries order[starts[i]], ..., order[starts[i + 1] - 1].
-nb::tuple largest_entries(const Array& x, const Array& unit, const std::vector<int>& order,
-                          const std::vector<int>& starts) {
-    const std::size_t width = unit.size(), n = x.shape(0), groups = starts.size();
-    if (x.ndim() != 2 || x.shape(1) != width || width % 2 != 0 || order.size() != width)
-        throw nb::value_error("x, unit or order has another shape");
-    expect_within("order", order, 0, static_cast<int>(width) - 1);
-    expect_within("starts", starts, 0, static_cast<int>(width) - 1);
-    std::vector<double> size(2 * n), norms(groups);
-    const double* row = x.data();
-    for (std::size_t i = 0; i < n; ++i, row += width) {
-        for (std::size_t k = 0; k < width; ++k)
-            take_largest(std::abs(row[k] / unit.data()[k]), size[2 * i + (2 * k >= width)]);
-        for (std::size_t g = 0; g < groups; ++g) {
-            const std::size_t end = g + 1 < groups ? starts[g + 1] : width;
-            double square = 0.0;
-            for (std::size_t k = starts[g]; k < end; ++k) square += row[order[k]] * row[order[k]];
-            take_largest(square, norms[g]);
-        }
-    }
-    for (double& norm : norms) norm = std::sqrt(norm);
-    return nb::make_tuple(owned_array(std::move(size), {n, 2}), owned_array(std::move(norms)));
+// LargestNorms of the rows of x (n, width).
+std::vector<double> largest_norms(const Array& x, const std::vector<int>& order,
+                                  const std::vector<int>& starts) {
+    if (x.ndim() != 2) throw nb::value_error("x has another shape");
+    LargestNorms norms(order, starts, x.shape(1));
+    for (std::size_t i = 0; i < x.shape(0); ++i) norms.take(x.data() + i * x.shape(1));
+    return norms.norms();
 }
 
 // ---- Dense output -------------------------------------------------------------------------------
@@ -1450,7 +1468,7 @@ nb::object py_recorded_dips(const DipSearch& search, const Array& times, const A
 void bind_dense_output(nb::module_& m) {
     m.def("recorded_dips", &py_recorded_dips);
     bind_struct<PySteps>(m, "StepArrays");
-    m.def("largest_entries", &largest_entries);
+    m.def("largest_norms", &largest_norms, nb::arg("x"), nb::arg("order"), nb::arg("starts"));
     nb::class_<PyDense>(m, "DenseOutput")
         .def(nb::init<int, int, const std::vector<SchemeDense>&, const DenseConstants&,
                       const PySteps&>(),

@@ -29,7 +29,7 @@ void SmoothIntervals::check() const {
 }
 
 void StepRecords::append(const StepResult& r, double t_new, int placement) {
-    const auto extend = [](std::vector<double>& to, const std::vector<double>& from) {
+    const auto extend = [](auto& to, const std::vector<double>& from) {
         to.insert(to.end(), from.begin(), from.end());
     };
     times.push_back(t_new);
@@ -45,9 +45,10 @@ void StepRecords::append(const StepResult& r, double t_new, int placement) {
 }
 
 void StepRecords::clear() {
-    for (auto* values : {&times, &states, &rates, &corrections, &sigmas, &ranks, &error_ratios,
+    for (auto* values : {&times, &states, &corrections, &sigmas, &ranks, &error_ratios,
                          &placements, &stiff, &held, &breaks, &break_rates})
         values->clear();
+    rates.clear();
     zones.clear();
 }
 

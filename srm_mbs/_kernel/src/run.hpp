@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "control.hpp"
+#include "large_array.hpp"
 #include "passage.hpp"
 #include "struct_fields.hpp"
 
@@ -75,7 +76,8 @@ struct ZoneRecord {
 
 // The accepted steps, one after the other.
 struct StepRecords {
-    std::vector<double> times, states, rates, corrections, sigmas, ranks, error_ratios;
+    std::vector<double> times, states, corrections, sigmas, ranks, error_ratios;
+    LargeArray rates;                // most of the memory: small pages take time to get and give back
     std::vector<double> placements;  // 0: none, 1: placed, 2: redone, or critical
     std::vector<double> stiff;       // 1: the problem had been found to be stiff
     std::vector<double> held;        // 1: a stage kept the normals of the last node

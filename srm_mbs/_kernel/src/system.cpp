@@ -8,7 +8,6 @@
 #include <pinocchio/algorithm/crba.hpp>
 #include <pinocchio/algorithm/joint-configuration.hpp>
 #include <pinocchio/algorithm/jacobian.hpp>
-#include <pinocchio/algorithm/kinematics.hpp>
 #include <pinocchio/algorithm/rnea-derivatives.hpp>
 #include <pinocchio/algorithm/rnea.hpp>
 
@@ -170,22 +169,6 @@ const pinocchio::Model& checked_model(const pinocchio::Model& model) {
     return model;
 }
 
-// Refuses joints and columns that the model does not have.
-void check_indices(const ForceElement& force, const pinocchio::Model& model) {
-    const long nq = model.nq, nv = model.nv, joints = model.njoints;
-    for (const Anchor* anchor : {&force.a, &force.b})
-        expect_within("Anchor.joint", anchor->joint, 0, joints - 1);
-    expect_within("ForceElement.columns", force.columns, 0, nv - 1);
-    expect_within("ForceElement.positions", force.positions, 0, nq - 1);
-    const bool torque = force.kind == ForceKind::joint_torque;
-    const long last = torque ? static_cast<long>(force.numbers.size()) : 1;
-    const bool on_joint = torque || force.kind == ForceKind::torsion_spring ||
-                          force.kind == ForceKind::limit_spring;
-    if (!on_joint) return;
-    expect_within("ForceElement.in_v", force.in_v, 0, nv - last);
-    if (!torque) expect_within("ForceElement.in_q", force.in_q, 0, nq - 1);
-}
-
 // Refuses rows, joints and columns that the model does not have.
 void check_indices(const SystemData& data, const pinocchio::Model& model) {
     const long nq = model.nq, nv = model.nv, rows = data.rows, joints = model.njoints;
@@ -218,7 +201,7 @@ void check_indices(const SystemData& data, const pinocchio::Model& model) {
         if (drive.in_v >= 0)
             expect_within("DrivenRow.in_q", drive.in_q, 0, nq - 1 - (drive.wraps ? 1 : 0));
     }
-    for (const ForceElement& force : data.forces) check_indices(force, model);
+    for (const ForceElement& force : data.forces) check_indices(force, nq, nv, joints);
     for (const GroupJoint& joint : data.groups) {
         const bool free = joint.group == Group::se3;
         expect_within("GroupJoint.group", static_cast<long>(joint.group), 0, 2);
@@ -560,7 +543,7 @@ void System::law_accelerations(double* out) {
                    tau.data(), &laws_);
     };
     if (code_) {  // it computes the kinematics of bushings only
-        pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
+        pinocchio_model::move_bodies(w);
         pinocchio::computeJointJacobians(w.model, w.data);
     }
     if (!closed_ && nv > one_pass_size) {
@@ -1002,7 +985,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     }
     if (!closed_) {
         if (!data_.forces.empty()) {
-            pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
+            pinocchio_model::move_bodies(w);
             pinocchio::computeJointJacobians(w.model, w.data);
             add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
                        laws);
@@ -1218,6 +1201,23 @@ void System::retract(const double* state, const double* delta, double* out) {
     for (int i = 0; i < nv; ++i) out[nq + i] = state[nq + i] + delta[nv + i];
 }
 
+void System::retract_some(const double* state, const double* delta,
+                          const std::vector<int>& moving, double* out) {
+    if (!vectors_and_groups(data_)) {
+        retract(state, delta, out);
+        return;
+    }
+    std::copy_n(state, nq + nv, out);
+    for (const int i : moving) {
+        if (const int k = data_.position_of[i]; k >= 0) out[k] = state[k] + delta[i];
+        out[nq + i] = state[nq + i] + delta[nv + i];
+    }
+    for (const GroupJoint& joint : data_.groups)
+        if (std::find(moving.begin(), moving.end(), joint.start) != moving.end())
+            joint_integrate(joint.group, state + joint.position, delta + joint.start,
+                            out + joint.position);
+}
+
 bool System::reachable(const double* start, const double* end) const {
     double moved[6];
     return std::all_of(data_.groups.begin(), data_.groups.end(), [&](GroupJoint joint) {
@@ -1378,7 +1378,7 @@ void System::move_bodies(const double* state) {
     auto& w = *work_;
     std::copy(state, state + nq, w.q.data());
     std::copy(state + nq, state + nq + nv, w.v.data());
-    pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
+    pinocchio_model::move_bodies(w);
 }
 
 void System::begin_step(double t, const double* state) {
@@ -1503,61 +1503,6 @@ std::array<double, 2> System::energies(const double* state, bool there) {
     }
     for (int i = 0; i < nv; ++i) kinetic += 0.5 * w.model.armature[i] * w.v[i] * w.v[i];
     return {kinetic, potential};
-}
-
-SeparateElements System::separate(const std::vector<ForceElement>& elements) const {
-    SeparateElements each;
-    for (const ForceElement& element : elements) {
-        check_indices(element, work_->model);
-        each.push_back({element});
-    }
-    return each;
-}
-
-void System::powers(const double* t, const double* states, std::size_t n,
-                    const SeparateElements& each, bool resting, double* out) {
-    auto& w = *work_;
-    std::vector<BushingStep> none;
-    const auto on_bodies = [](const ForceElement& e) {  // others depend on coordinates alone
-        return e.kind == ForceKind::spring_damper || e.kind == ForceKind::wrench ||
-               e.kind == ForceKind::bushing;
-    };
-    const bool bodies = std::any_of(each.begin(), each.end(), [&](const auto& one) {
-        return on_bodies(one.front());
-    });
-    std::vector<double> wrenches(6 * w.model.njoints);
-    const auto power_on = [&](int joint) {
-        const pinocchio::Motion motion = w.data.oMi[joint].act(w.data.v[joint]);
-        return dot(&wrenches[6 * joint], motion.toVector().data(), 6);
-    };
-    for (std::size_t i = 0; i < n; ++i, states += nq + nv) {
-        const double* const v = states + nq;
-        std::copy(states, v, w.q.data());
-        if (resting) w.v.setZero();
-        else std::copy(v, v + nv, w.v.data());
-        if (bodies) pinocchio::forwardKinematics(w.model, w.data, w.q, w.v);
-        // Bodies that move tell the power of a wrench, which takes no Jacobian.
-        if (bodies && resting) pinocchio::computeJointJacobians(w.model, w.data);
-        for (const std::vector<ForceElement>& one : each) {
-            const ForceElement& e = one.front();
-            if (!resting && e.kind == ForceKind::spring_damper) {
-                *out++ = spring_damper_power(e, data_.coincident, w);
-                continue;
-            }
-            const bool by_wrenches = !resting && on_bodies(e);
-            if (by_wrenches)
-                for (const int joint : {e.a.joint, e.b.joint})
-                    std::fill_n(&wrenches[6 * joint], 6, 0.0);
-            else
-                std::fill(f_.begin(), f_.end(), 0.0);
-            add_forces(one, data_.coincident, w, t[i], states, w.v.data(), none,
-                       by_wrenches ? nullptr : f_.data(), nullptr,
-                       by_wrenches ? wrenches.data() : nullptr);
-            if (!by_wrenches) *out++ = dot(f_.data(), v, nv);
-            else *out++ = power_on(e.a.joint) +
-                          (e.a.joint == e.b.joint ? 0.0 : power_on(e.b.joint));
-        }
-    }
 }
 
 void System::closures_at(double t, const double* q, double* g, double* G, int width) {

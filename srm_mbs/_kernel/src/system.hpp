@@ -138,7 +138,20 @@ struct ColumnGroups {
 };
 
 // Force elements whose powers are separate, each a list of its own.
-using SeparateElements = std::vector<std::vector<ForceElement>>;
+struct SeparateElements {
+    std::vector<std::vector<ForceElement>> each;
+    // The joints that move the bodies on which they act, ascending, and the velocity indices of all
+    // coordinates on which their powers depend.
+    std::vector<int> joints, coordinates;
+};
+
+// Steps with rates, and those stages of each that are asked for.
+struct StageArrays {
+    const double *times, *states;      // ends of the steps: (n + 1,), (n + 1, nx)
+    const double* rates;               // (n, width, 2 nv)
+    const double *A, *c;               // (stages, rows), (stages,)
+    std::size_t width, rows, stages;
+};
 
 class System {
 public:
@@ -208,6 +221,9 @@ public:
 
     // The manifold.
     void retract(const double* state, const double* delta, double* out);
+    // The same of the velocity coordinates `moving` alone, all of each joint; others may move by 0.
+    void retract_some(const double* state, const double* delta, const std::vector<int>& moving,
+                      double* out);
     // Whether joints have angles of which only cosine and sine are known.
     bool wraps() const { return !data_.wrapped_angles.empty(); }
     // Such angles take the turn nearest to the motion near (nv,), which others do not need.
@@ -242,11 +258,14 @@ public:
     // With all terms of other states lost: of one state g - s and G v - s' (rows,), and the kinetic
     // and the potential energy, of gravity and of springs; of n states the powers (n, forces) of
     // `each` element at the rates of the state or, if it is `resting`, those of its force at rest.
-    // there: whether the bodies are at this state already, from closure_errors().
+    // there: whether the bodies are at this state already, from closure_errors().  stage_powers: the
+    // same (chosen, stages, forces) at stages of the `chosen` steps.
     void closure_errors(double t, const double* state, double* g, double* rates);
     std::array<double, 2> energies(const double* state, bool there = false);
     void powers(const double* t, const double* states, std::size_t n,
-                const SeparateElements& each, bool resting, double* out);
+                const SeparateElements& elements, bool resting, double* out);
+    void stage_powers(const std::vector<long>& chosen, const StageArrays& steps,
+                      const SeparateElements& elements, double* out);
     SeparateElements separate(const std::vector<ForceElement>& elements) const;
     // Of the stage evaluated last: M x (nv,), all forces but those of closures (nv,), those among
     // them but those of inertia (nv,), and Gdot v - s'' (rows,).

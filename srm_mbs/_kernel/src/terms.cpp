@@ -3,6 +3,7 @@
 #include <type_traits>
 
 #include <pinocchio/algorithm/crba.hpp>
+#include <pinocchio/algorithm/kinematics.hpp>
 #include <pinocchio/algorithm/rnea.hpp>
 
 #include "workspace.hpp"
@@ -41,10 +42,41 @@ struct IsUsual : boost::static_visitor<bool> {
     }
 };
 
-// CrbaWorldConventionForwardStep and NLEForwardStep.  Flattened, because products of six numbers
-// cost less than calls.
+using AtState = boost::fusion::vector<const Model&, Data&, const Argument&, const Argument&>;
+
+// Placement and velocity of the body of a joint: ForwardKinematicFirstStep.
+template <typename JointModel>
+void move_body(const JointModelBase<JointModel>& jmodel,
+               JointDataBase<typename JointModel::JointDataDerived>& jdata, const Model& model,
+               Data& data, const Argument& q, const Argument& v) {
+    const JointIndex i = jmodel.id(), parent = model.parents[i];
+    jmodel.calc(jdata.derived(), q, v);
+    data.liMi[i] = model.jointPlacements[i] * jdata.M();
+    data.v[i] = jdata.v();
+    if (parent > 0) {
+        data.oMi[i] = data.oMi[parent] * data.liMi[i];
+        data.v[i] += data.liMi[i].actInv(data.v[parent]);
+    } else {
+        data.oMi[i] = data.liMi[i];
+    }
+}
+
+// Flattened, because products of six numbers cost less than calls.
+struct Move : pinocchio::fusion::JointUnaryVisitorBase<Move> {
+    using ArgsType = AtState;
+
+    template <typename JointModel>
+    [[gnu::flatten]] static void algo(const JointModelBase<JointModel>& jmodel,
+                                      JointDataBase<typename JointModel::JointDataDerived>& jdata,
+                                      const Model& model, Data& data, const Argument& q,
+                                      const Argument& v) {
+        if constexpr (usual<JointModel>) move_body(jmodel, jdata, model, data, q, v);
+    }
+};
+
+// CrbaWorldConventionForwardStep and NLEForwardStep.
 struct Forward : pinocchio::fusion::JointUnaryVisitorBase<Forward> {
-    using ArgsType = boost::fusion::vector<const Model&, Data&, const Argument&, const Argument&>;
+    using ArgsType = AtState;
 
     template <typename JointModel>
     [[gnu::flatten]] static void algo(const JointModelBase<JointModel>& jmodel,
@@ -53,15 +85,7 @@ struct Forward : pinocchio::fusion::JointUnaryVisitorBase<Forward> {
                                       const Argument& v) {
         if constexpr (usual<JointModel>) {
             const JointIndex i = jmodel.id(), parent = model.parents[i];
-            jmodel.calc(jdata.derived(), q, v);
-            data.liMi[i] = model.jointPlacements[i] * jdata.M();
-            data.v[i] = jdata.v();
-            if (parent > 0) {
-                data.oMi[i] = data.oMi[parent] * data.liMi[i];
-                data.v[i] += data.liMi[i].actInv(data.v[parent]);
-            } else {
-                data.oMi[i] = data.liMi[i];
-            }
+            move_body(jmodel, jdata, model, data, q, v);
             jmodel.jointExtendedModelCols(data.J) = data.oMi[i].act(jdata.S());
             data.oYcrb[i] = data.oMi[i].act(model.inertias[i]);
             data.a_gf[i] = jdata.c() + (data.v[i] ^ jdata.v());
@@ -94,6 +118,24 @@ bool has_usual_joints(const Model& model) {
     for (std::size_t i = 1; i < model.joints.size(); ++i)
         if (!boost::apply_visitor(IsUsual(), model.joints[i].toVariant())) return false;
     return true;
+}
+
+void move_bodies(Workspace& work, const std::vector<int>* joints) {
+    const Model& model = work.model;
+    Data& data = work.data;
+    const Argument q(work.q), v(work.v);
+    if (!work.one_pass) {
+        pinocchio::forwardKinematics(model, data, q, v);
+        return;
+    }
+    data.v[0].setZero();
+    const auto move = [&](int i) {
+        Move::run(model.joints[i], data.joints[i], AtState(model, data, q, v));
+    };
+    if (joints)
+        for (const int i : *joints) move(i);
+    else
+        for (int i = 1; i < model.njoints; ++i) move(i);
 }
 
 void compute_terms(Workspace& work) {

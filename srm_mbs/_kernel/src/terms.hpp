@@ -1,6 +1,8 @@
 // Mass matrix, nonlinear effects and the kinematics of both, in one pass over the tree.
 #pragma once
 
+#include <vector>
+
 #include <pinocchio/multibody.hpp>
 
 namespace pinocchio_model {
@@ -16,5 +18,9 @@ bool has_usual_joints(const pinocchio::Model& model);
 // Computes M, nle, J, oMi, v, a_gf as the two algorithms do; Ag refers to the origin of the world.
 // With other joints it calls the two algorithms.
 void compute_terms(Workspace& work);
+
+// Pinocchio's forwardKinematics at q and v of the workspace, by the same statements: of all bodies or,
+// which costs less, of those of `joints` alone, ascending and with the parents of each.
+void move_bodies(Workspace& work, const std::vector<int>* joints = nullptr);
 
 }  // namespace pinocchio_model

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.analysis.accuracy.samples import Samples
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import constraint_angles
@@ -66,19 +64,31 @@ class EnergyError:
     rounding: float
 
 
+@dataclass(frozen=True)
+class _RowsByUnit:
+    """The closure rows and drives of each unit that they have.
+
+    Attributes
+    ----------
+    units
+        Each unit, and the size of the mechanism in it.
+    order, starts
+        Indices of the rows, those of one unit after those of the other, and where these begin.
+    """
+
+    units: list[tuple[str, float]]
+    order: list[int]
+    starts: list[int]
+
+
 @per_model
-def _rows_by_unit(mechanism: Mechanism) -> list[tuple[str, BoolArray | slice, float]]:
-    """Unit, rows and scale of the closure rows and drives of each unit."""
+def _rows_by_unit(mechanism: Mechanism) -> _RowsByUnit:
     angles = constraint_angles(mechanism)
-    units = ("m", ~angles, mechanism.structure.units.length), ("rad", angles, 1.0)
-    return [
-        (unit, slice(None) if own.all() else own, scale) for unit, own, scale in units if own.any()
-    ]
-
-
-def _largest_norm(errors: FloatArray) -> float:
-    """Of the rows of ``errors`` (n, k)."""
-    return math.sqrt(np.maximum.reduce(np.add.reduce(errors * errors, axis=1)))
+    own = {"m": np.flatnonzero(~angles).tolist(), "rad": np.flatnonzero(angles).tolist()}
+    sizes = {"m": mechanism.structure.units.length, "rad": 1.0}
+    units = [unit for unit in own if own[unit]]
+    starts = [0, len(own[units[0]])][: len(units)]
+    return _RowsByUnit([(unit, sizes[unit]) for unit in units], own["m"] + own["rad"], starts)
 
 
 def drift_of(samples: Sequence[Samples]) -> tuple[Drift, ...]:
@@ -94,14 +104,15 @@ def drift_of(samples: Sequence[Samples]) -> tuple[Drift, ...]:
         run, nq = part.run, part.run.mechanism.model.nq
         if not run.mechanism.constrained:
             continue
-        ends = [errors[: len(part.ends)] for errors in run.invariants[:2]]
+        rows, norms = _rows_by_unit(run.mechanism), run.observables.largest_norms
         q, v = part.even_states[:, :nq], part.even_states[:, nq:]
         between = run.observables.closure_errors(part.even, q, v)
-        for unit, own, scale in _rows_by_unit(run.mechanism):
-            largest = [_largest_norm(errors[:, own]) for errors in ends]
-            more = [_largest_norm(errors[:, own]) for errors in between]
-            found.setdefault(unit, []).append([*largest, *np.maximum(largest, more), scale])
-    worst = {unit: np.max(parts, axis=0).tolist() for unit, parts in found.items()}
+        at_ends = [errors[: len(part.ends)] for errors in run.invariants[:2]]
+        sizes = [norms(errors, rows.order, rows.starts) for errors in (*at_ends, *between)]
+        for (unit, scale), (*largest, position, rate) in zip(rows.units, zip(*sizes)):
+            more = np.maximum(largest, (position, rate))
+            found.setdefault(unit, []).append([*largest, *more, scale])
+    worst = {unit: np.maximum.reduce(parts).tolist() for unit, parts in found.items()}
     return tuple(
         Drift(unit, *(*largest, largest[0] / scale)) for unit, (*largest, scale) in worst.items()
     )

@@ -16,6 +16,7 @@ import numpy as np
 
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.analysis.accuracy.samples import Samples, sample_states, sample_times
+from srm_mbs.dynamics.observables import NO_ANGLES
 from srm_mbs.dynamics.scaling import angle_coordinates
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.psrm import PSRM
@@ -26,6 +27,8 @@ from srm_mbs.simulation.result import SimulationResult
 
 READING_ERROR = 2e-3
 """Largest error of reading a rerun between its steps, over the tolerance of the one before it."""
+READING_PART = 5e-4
+"""The same, over the difference of the run from the tightest one, if that is larger."""
 READING_MARGIN = 5.0
 """Difference of two runs, over that error, below which they are read by dense output."""
 JUMP_MARGIN = 1e-9
@@ -266,14 +269,18 @@ def estimate_error(
     known = times, _ = sample_states(solution, samples)
     # A scheme has its order at the ends of steps only; the coarsest grid is a subset of the others.
     whole_grid = sample_times(runs[0][1], fixed=True) if fixed else times
-    errors = [] if fixed else [READING_ERROR * min(setting for setting, _ in runs[:-1])]
-    for reading_error in (*errors, None):
-        readings = Readings(solution, reading_error, known)
+    least = 0.0 if fixed else READING_ERROR * min(setting for setting, _ in runs[:-1])
+    part = READING_PART
+    readings = Readings(solution, known)
+    while True:
+        readings.allowed = least
         kept = whole = compare(solution, partner, times, readings)
         grid, apart = whole_grid, whole.until(DISAGREEMENT)
         if apart is not None:
             kept = compare(solution, partner, times[times < apart], readings)
             grid = whole_grid[whole_grid < apart]
+        if least:
+            readings.allowed = max(least, part * kept.largest)
         differences = [
             # Adaptive runs were compared with their partner on this grid already.
             kept.largest
@@ -281,8 +288,10 @@ def estimate_error(
             else compare(run, tightest, grid, readings).largest
             for _, run in runs[:-1]
         ]
-        if reading_error is not None and min(differences) > READING_MARGIN * reading_error:
+        if not least or min(differences) > READING_MARGIN * readings.allowed:
             break
+        # Smaller ones take closer readings.
+        least, part = (least, 0.0) if readings.allowed > least else (0.0, 0.0)
     compared = kept.comparison()
     comparison = compared if kept is whole else whole.comparison()
     order = observed_order([setting for setting, _ in runs], differences)
@@ -376,33 +385,34 @@ class Readings:
     ----------
     solution
         The run whose error is estimated.
-    allowed
-        Largest error of reading a rerun, in units; None to read all by dense output.
     known
-        Times (n,) s and the states (n, nq + nv) of ``solution`` there.
+        Times (n,) s and the states (n, nq + nv) of ``solution`` there, if they have been read.
+
+    Attributes
+    ----------
+    allowed
+        Largest error of reading a rerun from now on, in units; 0 to read by dense output.
     """
 
     def __init__(
-        self,
-        solution: SimulationResult,
-        allowed: float | None = None,
-        known: tuple[FloatArray, FloatArray] | None = None,
+        self, solution: SimulationResult, known: tuple[FloatArray, FloatArray] | None = None
     ) -> None:
+        self.allowed = 0.0
         self._solution = solution
-        unit = solution.mechanism.structure.units.state
-        self._allowed = None if allowed is None else allowed * unit
-        self._known: dict[tuple[int, bytes], FloatArray] = {}
+        # Of each run and times, what was allowed and the states.
+        self._known: dict[tuple[int, bytes], tuple[float, FloatArray]] = {}
         if known is not None:
-            self._known[id(solution), known[0].tobytes()] = known[1]
+            self._known[id(solution), known[0].tobytes()] = 0.0, known[1]
 
     def __call__(self, run: SimulationResult, times: FloatArray) -> FloatArray:
         """States (n, nq + nv) at the ``times`` (n,) s."""
+        allowed = 0.0 if run is self._solution else self.allowed
         key = id(run), times.tobytes()
         found = self._known.get(key)
-        if found is None:
-            found = run.states(times, None if run is self._solution else self._allowed)
-            self._known[key] = found
-        return found
+        if found is None or found[0] > allowed:
+            errors = allowed * run.mechanism.structure.units.state if allowed else None
+            found = self._known[key] = allowed, run.states(times, errors)
+        return found[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,9 +425,9 @@ class Differences(Sizes):
         As in :class:`Sizes`.
     jumps
         As in :class:`Comparison`.
-    norms : (2 k,)
+    norms
         The largest norm at any time of the motion from one to the other of each of k parts of the
-        joints (:class:`Parts`), and of the change of its rates.
+        joints (:class:`Parts`), and then of the change of the rates of each.
     states : (n, nq + nv)
         Those of the first one.
     run
@@ -425,23 +435,22 @@ class Differences(Sizes):
     """
 
     jumps: FloatArray
-    norms: FloatArray
+    norms: list[float]
     states: FloatArray
     run: SimulationResult
 
     def comparison(self) -> Comparison:
         """With the largest difference of each joint."""
-        mechanism, run, states = self.run.mechanism, self.run, self.states
-        model, observables = mechanism.model, run.segments[0].observables
-        moved = observables.differences(np.repeat(states[:1], len(states), axis=0), states)
-        moved[:, model.nv :] = states[:, model.nq :]
-        for name, k in _turning_joints(mechanism):
-            angle = run.unwrapped(name, self.t, states)
-            moved[:, k] = angle - angle[:1]
-        parts = _parts(mechanism)
-        units = mechanism.structure.units.state
-        _, norms = observables.largest_entries(moved, units, parts.order, parts.starts)
-        numbers = np.concatenate((self.norms, norms)).reshape(4, -1).T.tolist()
+        run, start = self.run, self.states[:1].copy()
+        start[:, run.mechanism.model.nq :] = 0.0  # differences from there are the rates themselves
+        parts = _parts(run.mechanism)
+        angles = [
+            angle - angle[:1]
+            for angle in (run.unwrapped(name, self.t, self.states) for name in parts.turned)
+        ]
+        _, norms = _largest(run, start, self.states, angles)
+        count = len(parts.names)
+        numbers = zip(self.norms[:count], self.norms[count:], norms[:count], norms[count:])
         joints = tuple(JointDifference(*own, *each) for own, each in zip(parts.names, numbers))
         return Comparison(self.t, self.size, joints, self.jumps)
 
@@ -458,14 +467,25 @@ def compare(
     if len(run.segments) > 1 or len(other.segments) > 1:
         allowed, jumps = _between_jumps(run, other, times)
         times = times[allowed]
-    mechanism, observables = run.mechanism, run.segments[0].observables
     a, b = read(run, times), read(other, times)
-    apart = observables.differences(a, b)
-    for name, k in _turning_joints(mechanism):
-        apart[:, k] = other.unwrapped(name, times, b) - run.unwrapped(name, times, a)
-    parts, units = _parts(mechanism), mechanism.structure.units.state
-    size, norms = observables.largest_entries(apart, units, parts.order, parts.starts)
+    angles = [
+        other.unwrapped(name, times, b) - run.unwrapped(name, times, a)
+        for name in _parts(run.mechanism).turned
+    ]
+    size, norms = _largest(run, a, b, angles)
     return Differences(times, size, jumps, norms, a, run)
+
+
+def _largest(
+    run: SimulationResult, a: FloatArray, b: FloatArray, angles: list[FloatArray]
+) -> tuple[FloatArray, list[float]]:
+    """Sizes (n, 2) of the differences of the states a (n, nx) or (1, nx) and b (n, nx) of ``run``
+    or another one, and norms of their parts; ``angles``: those (n,) of each joint of
+    :attr:`Parts.turned`."""
+    parts, units = _parts(run.mechanism), run.mechanism.structure.units.state
+    turned = [*parts.turned.values()], np.column_stack(angles) if angles else NO_ANGLES
+    observables = run.segments[0].observables
+    return observables.largest_differences(a, b, units, parts.order, parts.starts, *turned)
 
 
 @dataclass(frozen=True, eq=False)
@@ -480,27 +500,25 @@ class Parts:
         Indices of their coordinates, one part after the other, and those of their rates.
     starts
         Where the coordinates and the rates of each begin in ``order``.
+    turned
+        Velocity index, by name, of each joint whose angle is stored as cosine and sine.
     """
 
     names: list[tuple[str, str]]
     order: list[int]
     starts: list[int]
-
-
-@per_model
-def _turning_joints(mechanism: MechanismData) -> list[tuple[str, int]]:
-    """Name and velocity index of the joints whose angle is stored as cosine and sine."""
-    joints = [(name, mechanism.joint(name)) for name in mechanism.joint_names]
-    return [(name, joint.idx_v) for name, joint in joints if joint.nv == 1 and joint.nq > 1]
+    turned: dict[str, int]
 
 
 @per_model
 def _parts(mechanism: MechanismData) -> Parts:
     """The parts of all joints."""
     turns = angle_coordinates(mechanism.model)
-    names, indices = [], []
+    names, indices, turned = [], [], {}
     for name in mechanism.joint_names:
         joint = mechanism.joint(name)
+        if joint.nv == 1 and joint.nq > 1:
+            turned[name] = joint.idx_v
         own = np.arange(joint.idx_v, joint.idx_v + joint.nv)
         for unit, chosen in (("m", own[~turns[own]]), ("rad", own[turns[own]])):
             if len(chosen):
@@ -508,7 +526,7 @@ def _parts(mechanism: MechanismData) -> Parts:
                 indices.append(chosen)
     indices += [mechanism.model.nv + own for own in indices]
     starts = np.cumsum([0, *(len(own) for own in indices[:-1])])
-    return Parts(names, np.concatenate(indices).tolist(), starts.tolist())
+    return Parts(names, np.concatenate(indices).tolist(), starts.tolist(), turned)
 
 
 def _jump_times(run: SimulationResult) -> Sequence[float]:

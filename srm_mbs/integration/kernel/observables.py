@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from srm_mbs.dynamics.forces import ForceKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.observables import (
+    NO_ANGLES,
     Invariants,
     Observables,
     conservative_elements,
@@ -193,11 +195,21 @@ class CompiledObservables(Observables):
             found[others] = super().smallest_values(geometry, values, k, t[others], q[others])
         return found
 
-    def differences(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        if a.shape[1] == 2 * self.mechanism.model.nv:
-            return b - a
+    def largest_differences(
+        self,
+        a: FloatArray,
+        b: FloatArray,
+        unit: FloatArray,
+        order: list[int],
+        starts: list[int],
+        turned: Sequence[int] = (),
+        angles: FloatArray = NO_ANGLES,
+    ) -> tuple[FloatArray, list[float]]:
+        """As the reference."""
         with self._all_rows() as kernel_system:
-            return kernel_system.differences(a, b)  # type: ignore[no-any-return]
+            return kernel_system.largest_differences(  # type: ignore[no-any-return]
+                a, b, unit, order, starts, turned, angles
+            )
 
     def moved(self, states: FloatArray, motions: FloatArray) -> FloatArray:
         if states.shape[1] == motions.shape[1]:
@@ -206,11 +218,9 @@ class CompiledObservables(Observables):
             return kernel_system.moved(states, motions)  # type: ignore[no-any-return]
 
     @staticmethod
-    def largest_entries(
-        x: FloatArray, unit: FloatArray, order: list[int], starts: list[int]
-    ) -> tuple[FloatArray, FloatArray]:
+    def largest_norms(x: FloatArray, order: list[int], starts: list[int]) -> list[float]:
         """As the reference."""
-        return core.largest_entries(x, unit, order, starts)  # type: ignore[no-any-return,union-attr]
+        return core.largest_norms(x, order, starts)  # type: ignore[no-any-return,union-attr]
 
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
         with self._all_rows() as kernel_system:

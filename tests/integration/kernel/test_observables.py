@@ -112,16 +112,22 @@ def test_motions_between_many_states_are_those_of_the_reference() -> None:
         _, q, v = states(mechanism)
         here = np.hstack([q, v])
         there = np.roll(here, 1, axis=0)
-        found, expected = (own.differences(here, there) for own in (kernel_ones, reference))
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
-        width = found.shape[1]
-        order, starts = list(range(width - 1, -1, -1)), [0, 1, width // 2]
-        for x in (found, np.where(np.arange(width) == 1, np.nan, found)):
-            numbers = x, np.linspace(0.5, 3.0, width), order, starts
-            for one, other in zip(
-                kernel_ones.largest_entries(*numbers), reference.largest_entries(*numbers)
-            ):
-                np.testing.assert_allclose(one, other, rtol=1e-12)
+        width = 2 * mechanism.model.nv
+        unit, order = np.linspace(0.5, 3.0, width), list(range(width - 1, -1, -1))
+        turned, angles = [1], np.linspace(-1.0, 1.0, len(there))[:, None]
+        missing = np.where(np.arange(len(there)) == 1, np.nan, angles[:, 0])[:, None]
+        for start, *motions in (
+            (here,),
+            (here[:1],),  # from one state to each
+            (here, turned, angles),
+            (here, turned, missing),
+        ):
+            numbers = start, there, unit, order, [0, 1, width // 2], *motions
+            found, expected = (
+                own.largest_differences(*numbers) for own in (kernel_ones, reference)
+            )
+            for one, other in zip(found, expected):
+                np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
 
 
 def test_closures_on_lie_groups_are_those_of_the_reference() -> None:

@@ -1,8 +1,9 @@
 r"""The terms of an evaluation of a mechanism, recorded and written as C.
 
 One pass over the tree, in the frame of one body or of the ground.  With the columns J_k of a
-joint's motions about the origin of this frame, V the spatial velocity of its body, p its parent, and u, w its linear and angular velocity
-against the parent, the accelerations without those of rates are
+joint's motions about the origin of this frame, V the spatial velocity of its body, p its parent,
+and u, w its linear and angular velocity against the parent, the accelerations without those of
+rates are
 
     V = V_p + sum J_k v_k,     \alpha = \alpha_p + \omega_p x w,     a_0 = -gravity,
     a(x) = a(o) + ([\alpha] + [\omega]^2) (x - o),     a(o) = a_p(o) + (\omega_p + \omega) x u,
@@ -832,7 +833,9 @@ class RecordedTerms(NamedTuple):
 
 
 def record_terms(structure: Structure, frame: int = GROUND) -> RecordedTerms:
-    """The terms of ``structure``, recorded in the frame of the body of this motion.
+    """The terms of ``structure``, recorded in the frame of the body of this motion or of the ground.
+
+    Bushings take their bodies in that of the ground.
 
     Raises
     ------

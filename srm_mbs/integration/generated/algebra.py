@@ -163,26 +163,26 @@ static inline void take_row(Factors *w, const double *G, int row) {
   AT_ROWS(w)[row] = (long long)bits;
 }
 
-/* The squared norm of a column in the rows that are left. */
-static __attribute__((noinline, cold)) double square_of(const Factors *w, int column,
-                                                        uint64_t active) {
+/* Computes the squared norm of a column in the rows that are left. */
+static __attribute__((noinline, cold)) void square_again(const Factors *w, int column,
+                                                         vec *squares, vec *limits,
+                                                         uint64_t active) {
   double sum = 0.0;
   for IN(i, (uint64_t)AT_ROWS(w)[column] & active)
     sum += AT(w->X[i], column) * AT(w->X[i], column);
-  return sum;
+  AT(squares, column) = sum;
+  AT(limits, column) = RESOLVED * sum;
 }
 
 /* The column of the largest norm in the rows that are left, which is the next in `order`. */
 static ALWAYS_INLINE int next_column(Factors *w, int k, vec *squares, vec *limits,
                                      uint64_t active) {
-  double *const square = (double *)squares, *const limit = (double *)limits, most = -1.0;
+  const double *const square = (const double *)squares, *const limit = (const double *)limits;
+  double most = -1.0;
   int best = k;
   UP_FROM(n, k, ROWS) {
     const int j = w->order[n];
-    if (square[j] < limit[j]) {
-      square[j] = square_of(w, j, active);
-      limit[j] = RESOLVED * square[j];
-    }
+    if (square[j] < limit[j]) square_again(w, j, squares, limits, active);
     if (square[j] > most) most = square[j], best = n;
   }
   const int column = w->order[best];

@@ -833,9 +833,9 @@ class RecordedTerms(NamedTuple):
 
 
 def record_terms(structure: Structure, frame: int = GROUND) -> RecordedTerms:
-    """The terms of ``structure``, recorded in the frame of the body of this motion or of the ground.
+    """The terms of ``structure``, recorded in the frame of this body.
 
-    Bushings take their bodies in that of the ground.
+    ``frame`` is the number of a motion or GROUND, in whose frame bushings take their bodies.
 
     Raises
     ------

@@ -75,6 +75,7 @@ def algebra_of(
     entry = "U[{}][{}]" if unrolled else "AT(U[{}], {})"
     values = {
         "LOOPS": _UNROLLED_LOOPS if unrolled else _LOOPS,
+        "CLEARED": _UNROLLED_CLEARED if unrolled else _CLEARED,
         "TIMES_Q": _UNROLLED_TIMES_Q if unrolled else _TIMES_Q,
         "N": nv,
         "ROWS": rows,
@@ -123,7 +124,8 @@ enum { WIDE = (ROWS + LANES - 1) / LANES, HIGH = (N + LANES - 1) / LANES, SHORT 
 /* k = 0, 1, ... and backwards, and the columns of U in its row k, backwards: loops that vanish if
  * they are unrolled. */
 #define ALWAYS_INLINE inline __attribute__((always_inline))
-#define UP(k, count) _Pragma(UNROLLED) for (int k = 0; k < (count); ++k)
+#define UP_FROM(k, first, count) _Pragma(UNROLLED) for (int k = first; k < (count); ++k)
+#define UP(k, count) UP_FROM(k, 0, count)
 #define DOWN(k, count) _Pragma(UNROLLED) for (int k = (count) - 1; k >= 0; --k)
 @LOOPS@
 #define AT(x, i) (((double *)(x))[i])
@@ -161,26 +163,26 @@ static inline void take_row(Factors *w, const double *G, int row) {
   AT_ROWS(w)[row] = (long long)bits;
 }
 
-/* The squared norm of a column in the rows that are left. */
-static __attribute__((noinline, cold)) double square_of(const Factors *w, int column,
-                                                        uint64_t active) {
+/* Computes the squared norm of a column in the rows that are left. */
+static __attribute__((noinline, cold)) void square_again(const Factors *w, int column,
+                                                         vec *squares, vec *limits,
+                                                         uint64_t active) {
   double sum = 0.0;
   for IN(i, (uint64_t)AT_ROWS(w)[column] & active)
     sum += AT(w->X[i], column) * AT(w->X[i], column);
-  return sum;
+  AT(squares, column) = sum;
+  AT(limits, column) = RESOLVED * sum;
 }
 
 /* The column of the largest norm in the rows that are left, which is the next in `order`. */
 static ALWAYS_INLINE int next_column(Factors *w, int k, vec *squares, vec *limits,
                                      uint64_t active) {
-  double *const square = (double *)squares, *const limit = (double *)limits, most = -1.0;
+  const double *const square = (const double *)squares, *const limit = (const double *)limits;
+  double most = -1.0;
   int best = k;
-  for (int n = k; n < ROWS; ++n) {
+  UP_FROM(n, k, ROWS) {
     const int j = w->order[n];
-    if (square[j] < limit[j]) {
-      square[j] = square_of(w, j, active);
-      limit[j] = RESOLVED * square[j];
-    }
+    if (square[j] < limit[j]) square_again(w, j, squares, limits, active);
     if (square[j] > most) most = square[j], best = n;
   }
   const int column = w->order[best];
@@ -213,11 +215,16 @@ int srm_mbs_factor(void *work, const double *restrict M, const double *restrict 
   vec(*const X)[WIDE] = w->X, (*const V)[HIGH] = w->V;
   vec sums[WIDE], squares[WIDE], limits[WIDE];
   EACH(b, WIDE) sums[b] = squares[b] = (vec){0};
-  memset(X, 0, sizeof w->X);
-  for (int j = 0; j < ROWS; ++j) AT_ROWS(w)[j] = (long long)support[j];
+@CLEARED@
 @JACOBIAN@
 @OTHERS@
 """
+
+_CLEARED = """\
+  memset(X, 0, sizeof w->X);
+  for (int j = 0; j < ROWS; ++j) AT_ROWS(w)[j] = (long long)support[j];"""
+
+_UNROLLED_CLEARED = "  UNROLL(k, 0, N) EACH(b, WIDE) X[k][b] = (vec){0};"
 
 _SPARSE = """\
   vec(*const U)[HIGH] = w->U;
@@ -345,6 +352,14 @@ static ALWAYS_INLINE void solve_pivots(const Factors *w, const double *g, double
     UNROLL(m, 0, k) y -= x[m] * AT(w->X[m], column);
     x[k] = y * w->inverse_pivot[k];
   }
+}
+
+/* white = Q R^-T Pi^T g, of full rank. */
+static ALWAYS_INLINE void full_normal(const Factors *w, const double *restrict g,
+                                      double *restrict white) {
+  UNROLL(i, RANK, N) white[i] = 0.0;
+  solve_pivots(w, g, white);
+  times_q(w, white);
 }"""
 
 _TIMES_Q = """\
@@ -376,6 +391,15 @@ static ALWAYS_INLINE void solve_pivots(const Factors *w, const double *g, double
   vec left[WIDE] = {{0}};
   memcpy(left, g, ROWS * sizeof *g);
   for (int k = 0; k < RANK; ++k) solve_pivot(w, k, left, x);
+}
+
+/* white = Q R^-T Pi^T g, of full rank. */
+static ALWAYS_INLINE void full_normal(const Factors *w, const double *restrict g,
+                                      double *restrict white) {
+  vec x[HIGH] = {{0}};
+  solve_pivots(w, g, (double *)x);
+  times_q(w, (double *)x);
+  memcpy(white, x, N * sizeof *white);
 }"""
 
 _UNROLLED = """\
@@ -420,7 +444,8 @@ _UNROLLED = """\
       EACH(b, WIDE) s[b] += v[i] * X[i][b];
     }
     const double norm2 = norms[0] + norms[1];
-    const double alpha = v[k], beta = -copysign(sqrt(norm2), alpha), by = 1.0 / beta;
+    /* 1 / beta, without waiting for the root. */
+    const double alpha = v[k], beta = -copysign(sqrt(norm2), alpha), by = beta * (1.0 / norm2);
     const double scale = norm2 > 0.0 ? 1.0 / (alpha - beta) : 0.0;
     pivots[k] = fabs(beta);
     w->inverse_pivot[k] = by;
@@ -518,15 +543,10 @@ static __attribute__((noinline, cold)) void deficient_normal(const Factors *w, i
 
 /* white = Q R^-T Pi^T g */
 void srm_mbs_normal(const void *work, int rank, const double *restrict g, double *restrict white) {
-  const Factors *const w = work;
-  if (rank < RANK) {
-    deficient_normal(w, rank, g, white);
-    return;
-  }
-  vec x[HIGH] = {{0}};
-  solve_pivots(w, g, (double *)x);
-  times_q(w, (double *)x);
-  memcpy(white, x, N * sizeof *white);
+  if (rank < RANK)
+    deficient_normal(work, rank, g, white);
+  else
+    full_normal(work, g, white);
 }
 
 /* g = Pi R^-1 Q^T white */

@@ -144,6 +144,8 @@ class Recorder:
             return a.operands[1] if a.operands[0] is b else a.operands[0]
         if a.operation == "-" and a.operands[0] is b:
             return self.negate(a.operands[1])
+        if b.operation == "-" and b.operands[0] is a:
+            return b.operands[1]
         if b.operation == "+" and a in b.operands:
             return self.negate(b.operands[1] if b.operands[0] is a else b.operands[0])
         if a.depends == CONSTANT:

@@ -53,8 +53,8 @@ TURN_SIZE = 5
 class _Residual(Trace):
     """Records r, c and the laws."""
 
-    def __init__(self, structure: Structure) -> None:
-        super().__init__(structure)
+    def __init__(self, structure: Structure, frame: int) -> None:
+        super().__init__(structure, frame)
         leaf = self.recorder.leaf
         self.accelerations = [leaf(f"a[{i}]") for i in range(structure.nv)]
         self.multipliers = [leaf(f"lam[{i}]") for i in range(structure.rows)]
@@ -145,8 +145,9 @@ class Linearisation(NamedTuple):
 _NONE = Linearisation("", 0, 0)
 
 
-def linearisation_of(structure: Structure) -> Linearisation:
-    """The C of ``srm_mbs_linear_constants`` and ``srm_mbs_linearise``.
+def linearisation_of(structure: Structure, frame: int) -> Linearisation:
+    """The C of ``srm_mbs_linear_constants`` and ``srm_mbs_linearise``, recorded in the frame of the
+    body of this motion.
 
     The text is empty where nothing damps, because steps are then not stiff, and where there would
     be more than MOST_STATEMENTS.
@@ -158,7 +159,7 @@ def linearisation_of(structure: Structure) -> Linearisation:
     """
     if not _damped(structure):
         return _NONE
-    trace = _Residual(structure)
+    trace = _Residual(structure, frame)
     trace.record()
     nv, rows, laws = structure.nv, structure.rows, structure.held
     along: list[Direction] = [*trace.along_q, *trace.along_v]

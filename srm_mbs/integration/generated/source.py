@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from srm_mbs.integration.generated.algebra import algebra_of
+from srm_mbs.integration.generated.frames import shortest_terms
 from srm_mbs.integration.generated.linearisation import linearisation_of
 from srm_mbs.integration.generated.structure import Structure
-from srm_mbs.integration.generated.terms import record_terms
-from srm_mbs.integration.generated.writing import write_c
 
 ABI = 3
 """Version of the functions that the kernel calls: ``interface_version`` in generated.cpp."""
@@ -35,9 +34,8 @@ def source_of(structure: Structure) -> Source:
     UnsupportedElementError
         If two points of an element coincide in every configuration.
     """
-    recorded = record_terms(structure)
-    written = write_c(recorded.outputs, recorded.guards)
-    linear = linearisation_of(structure)
+    frame, recorded, written = shortest_terms(structure)
+    linear = linearisation_of(structure, frame)
     laws = sum(force.laws.length for force in structure.forces)
     sizes = (
         *(ABI, structure.nq, structure.nv, structure.rows, structure.rank),

@@ -1,8 +1,9 @@
 r"""The terms of an evaluation of a mechanism, recorded and written as C.
 
-One pass over the tree, in world axes.  With the columns J_k of a joint's motions about the world's
-origin, V the spatial velocity of its body, p its parent, and u, w its linear and angular velocity
-against the parent, the accelerations without those of rates are
+One pass over the tree, in the frame of one body or of the ground.  With the columns J_k of a
+joint's motions about the origin of this frame, V the spatial velocity of its body, p its parent,
+and u, w its linear and angular velocity against the parent, the accelerations without those of
+rates are
 
     V = V_p + sum J_k v_k,     \alpha = \alpha_p + \omega_p x w,     a_0 = -gravity,
     a(x) = a(o) + ([\alpha] + [\omega]^2) (x - o),     a(o) = a_p(o) + (\omega_p + \omega) x u,
@@ -66,19 +67,29 @@ Row = dict[int, Expression]
 
 
 class Column(NamedTuple):
-    """A column of the world Jacobian: the motion of a body by one rate."""
+    """The motion of a body by one rate; linear: that of its point at the frame's origin."""
 
     in_v: int
     linear: Vector
     angular: Vector
 
 
-class Body(NamedTuple):
-    """A body in world axes; the velocity is of its point at the world's origin, the acceleration of
-    its own origin."""
+class Place(NamedTuple):
+    """Where a body is."""
 
     rotation: Matrix
     origin: Vector
+
+    def point(self, local: Vector) -> Vector:
+        """The place of a point of the body."""
+        return add(self.origin, times(self.rotation, local))
+
+
+class Body(NamedTuple):
+    """A body that moves; the velocity is of its point at the frame's origin, the acceleration of
+    its own origin."""
+
+    place: Place
     velocity: Vector
     spin: Vector
     bias: Vector
@@ -86,9 +97,14 @@ class Body(NamedTuple):
     gradient: Matrix
     """Of the acceleration, by the place of a point: :func:`gradient_of`."""
 
+    @property
+    def rotation(self) -> Matrix:
+        """From the axes of the body."""
+        return self.place.rotation
+
     def point(self, local: Vector) -> Vector:
         """The place of a point of the body."""
-        return add(self.origin, times(self.rotation, local))
+        return self.place.point(local)
 
     def point_velocity(self, x: Vector) -> Vector:
         """Velocity of its point at ``x``."""
@@ -96,7 +112,7 @@ class Body(NamedTuple):
 
     def point_bias(self, x: Vector) -> Vector:
         """Acceleration of its point at ``x``, without those of the joints."""
-        return add(self.bias, times(self.gradient, subtract(x, self.origin)))
+        return add(self.bias, times(self.gradient, subtract(x, self.place.origin)))
 
 
 def gradient_of(spin: Vector, spin_bias: Vector) -> Matrix:
@@ -127,7 +143,7 @@ def turning_moment(body: Body, own: Moments) -> Vector:
 
 
 class Inertia(NamedTuple):
-    """Mass, mass centre and moments about it, in world axes."""
+    """Mass, mass centre and moments about it, in the axes of the frame."""
 
     mass: Expression
     centre: Vector
@@ -156,10 +172,14 @@ class Inertia(NamedTuple):
         return Inertia(mass, centre, self.moments.plus(other.moments).plus(shifted))
 
 
-class Trace:
-    """Records the terms of a structure."""
+GROUND = -1
+"""Number of the body that does not move."""
 
-    def __init__(self, structure: Structure) -> None:
+
+class Trace:
+    """Records the terms of a structure in the frame of the body of a motion, or of the ground."""
+
+    def __init__(self, structure: Structure, frame: int = GROUND) -> None:
         self.structure = structure
         self.recorder = recorder = Recorder()
         known = {ZERO: recorder.zero, ONE: recorder.one, MINUS_ONE: recorder.constant(-1.0)}
@@ -172,17 +192,13 @@ class Trace:
         zero, one = recorder.zero, recorder.one
         self.nothing: Vector = (zero, zero, zero)
         self.units: Matrix = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
-        gravity = self.take(structure.gravity)
-        spin_bias = -gravity[3], -gravity[4], -gravity[5]
-        self.ground = Body(
-            self.units,
-            self.nothing,
-            self.nothing,
-            self.nothing,
-            (-gravity[0], -gravity[1], -gravity[2]),
-            spin_bias,
-            gradient_of(self.nothing, spin_bias),
-        )
+        self.joints = [self._joint(motion) for motion in structure.motions]
+        self.places = self._places(frame)
+        ground, gravity = self.places[GROUND], self.take(structure.gravity)
+        bias = times(ground.rotation, (-gravity[0], -gravity[1], -gravity[2]))
+        spin_bias = times(ground.rotation, (-gravity[3], -gravity[4], -gravity[5]))
+        still = self.nothing
+        self.ground = Body(ground, still, still, bias, spin_bias, gradient_of(still, spin_bias))
         self.accelerations = [zero] * structure.nv
         """Those of the rates; without them, terms are nonlinear effects and bias."""
         self.held = recorder.leaf("held")
@@ -321,17 +337,40 @@ class Trace:
         rotation = self._of_quaternion(first + 3)
         return rotation, (q[first], q[first + 1], q[first + 2]), [*shifts, *turns]
 
-    def _move(self, motion: Motion) -> None:
+    def _places(self, frame: int) -> dict[int, Place]:
+        """Where the bodies are in the frame of one of them: those on its way to the ground, and
+        then the others."""
+        motions = self.structure.motions
+        out = {frame: Place(self.units, self.nothing)}
+        number = frame
+        while number >= 0:
+            motion, (rotation, origin) = motions[number], out[number]
+            placed, at = self.placement(motion.placement)
+            turned, moved, _ = self.joints[number]
+            before = product(rotation, transposed(turned))
+            above = product(before, transposed(placed))
+            way = add(times(above, at), times(before, moved))
+            number = motion.parent
+            out[number] = Place(above, subtract(origin, way))
+        for number, motion in enumerate(motions):
+            if number not in out:
+                parent = out[motion.parent]
+                placed, at = self.placement(motion.placement)
+                turned, moved, _ = self.joints[number]
+                before = product(parent.rotation, placed)
+                origin = add(parent.point(at), times(before, moved))
+                out[number] = Place(product(before, turned), origin)
+        return out
+
+    def _move(self, number: int, motion: Motion) -> None:
         """Append the body of ``motion`` and its columns."""
         parent = self.ground if motion.parent < 0 else self.bodies[motion.parent]
-        self.roots.append(len(self.roots) if motion.parent < 0 else self.roots[motion.parent])
-        placed, at = self.placement(motion.placement)
-        turned, moved, subspace = self._joint(motion)
-        before = product(parent.rotation, placed)
-        rotation = product(before, turned)
-        origin = add(parent.point(at), times(before, moved))
+        self.roots.append(number if motion.parent < 0 else self.roots[motion.parent])
+        place = self.places[number]
+        rotation, origin = place
         own = []
         linear, angular, ahead = self.nothing, self.nothing, self.nothing
+        _, _, subspace = self.joints[number]
         bias, spin_bias = parent.point_bias(origin), parent.spin_bias
         for i, (shift, turn) in enumerate(subspace, motion.in_v):
             along, about = times(rotation, shift), times(rotation, turn)
@@ -349,7 +388,7 @@ class Trace:
         spin_bias = add(spin_bias, cross(parent.spin, angular))
         velocity = add(parent.velocity, linear)
         gradient = gradient_of(spin, spin_bias)
-        self.bodies.append(Body(rotation, origin, velocity, spin, bias, spin_bias, gradient))
+        self.bodies.append(Body(place, velocity, spin, bias, spin_bias, gradient))
         self.columns.append(own)
         self.cells |= dict.fromkeys((column.in_v for column in own), self.roots[-1])
 
@@ -363,7 +402,7 @@ class Trace:
         return Inertia(mass, body.point((x, y, z)), own)
 
     def _force(self, body: Body, inertia: Inertia) -> tuple[Vector, Vector]:
-        """The wrench about the world's origin that accelerates a body."""
+        """The wrench about the frame's origin that accelerates a body."""
         force, moment = self.nothing, self.nothing
         if not inertia.mass.is_zero:
             force = scaled(inertia.mass, body.point_bias(inertia.centre))
@@ -381,8 +420,8 @@ class Trace:
 
     def move(self) -> None:
         """Bodies, their columns and their inertias."""
-        for motion in self.structure.motions:
-            self._move(motion)
+        for number, motion in enumerate(self.structure.motions):
+            self._move(number, motion)
         pairs = zip(self.structure.motions, self.bodies)
         self.inertias = [self._inertia(motion, body) for motion, body in pairs]
 
@@ -463,7 +502,7 @@ class Trace:
         return g, bias, G
 
     def columns_by_rate(self) -> dict[int, Column]:
-        """The columns of the world Jacobian, by the rate of each."""
+        """The columns of the Jacobian, by the rate of each."""
         return {column.in_v: column for own in self.columns for column in own}
 
     def _positions(
@@ -571,10 +610,10 @@ class Trace:
         for k, joint in enumerate(self.structure.bushing_joints):
             body, cell = self.body(joint), self.roots[self.structure.bodies[joint]]
             inverse = transposed(body.rotation)
-            velocity = times(inverse, body.point_velocity(body.origin))
+            velocity = times(inverse, body.point_velocity(body.place.origin))
             columns = [entry for column in inverse for entry in column]
             motion = (*velocity, *times(inverse, body.spin))
-            for i, values in enumerate((columns, body.origin, motion), 3 * k):
+            for i, values in enumerate((columns, body.place.origin, motion), 3 * k):
                 self.outputs += [
                     Output(f"B[{i}][{n}]", value, cell) for n, value in enumerate(values)
                 ]
@@ -710,7 +749,8 @@ class Trace:
         rotation, at = self._frame(force.joint_a, force.at_a)
         if force.in_link_axes:
             return at, times(rotation, (fx, fy, fz)), times(rotation, (mx, my, mz))
-        return at, (fx, fy, fz), (mx, my, mz)
+        axes = self.ground.rotation
+        return at, times(axes, (fx, fy, fz)), times(axes, (mx, my, mz))
 
     def _spring(
         self, force: Force, k: Expression, d: Expression, rest: Expression
@@ -792,15 +832,17 @@ class RecordedTerms(NamedTuple):
     along_v: list[Direction]
 
 
-def record_terms(structure: Structure) -> RecordedTerms:
-    """The terms of ``structure``, recorded.
+def record_terms(structure: Structure, frame: int = GROUND) -> RecordedTerms:
+    """The terms of ``structure``, recorded in the frame of this body.
+
+    ``frame`` is the number of a motion or GROUND, in whose frame bushings take their bodies.
 
     Raises
     ------
     UnsupportedElementError
         If two points of an element coincide in every configuration.
     """
-    trace = Trace(structure)
+    trace = Trace(structure, frame)
     try:
         trace.tree()
         trace.rows()

@@ -20,8 +20,8 @@ from srm_mbs.integration.generated.differentiation import (
     derivatives,
 )
 from srm_mbs.integration.generated.expressions import Expression, Recorder
+from srm_mbs.integration.generated.frames import shortest_terms
 from srm_mbs.integration.generated.structure import structure_of
-from srm_mbs.integration.generated.terms import record_terms
 from tests.support.bundled import load
 from tests.support.dynamics import mass_matrix, nonlinear_effects
 from tests.support.generated import values_of
@@ -79,7 +79,7 @@ class _Terms:
         self.mechanism, self.system = mechanism, make_system(mechanism)
         constants = self.system.constants()
         self.structure, self.p = structure_of(mechanism.model, constants)
-        self.terms = record_terms(self.structure)
+        self.terms = shortest_terms(self.structure).recorded
         # Forces also depend on laws that act.
         self.outputs = [o for o in self.terms.outputs if o.target.split("[")[0] in NAMES]
         self.nv, self.rows = self.structure.nv, self.structure.rows

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -15,13 +16,16 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.integration.generated.algebra import algebra_of
 from srm_mbs.integration.generated.code import generated_source, load_code
+from srm_mbs.integration.generated.expressions import live_nodes
+from srm_mbs.integration.generated.frames import shortest_terms
 from srm_mbs.integration.generated.structure import UnsupportedElementError, structure_of
+from srm_mbs.integration.generated.terms import GROUND, record_terms
 from srm_mbs.integration.kernel import backend
 from srm_mbs.integration.kernel.system import make_kernel_system
 from srm_mbs.model.forces import ForceElement
 from tests.support.bundled import load
 from tests.support.dynamics import mass_matrix, nonlinear_effects
-from tests.support.generated import GeneratedFunction
+from tests.support.generated import GeneratedFunction, values_of
 from tests.support.mechanisms import COMPILED_MODELS, along_x, rod
 
 pytestmark = [
@@ -296,6 +300,9 @@ FORCES = {
 }
 
 
+FORCES_ON_BODIES = ("spring", "spring without length", "rope", "wrench", "wrench of the link")
+
+
 @pytest.mark.parametrize("names", [tuple(FORCES)[:6], tuple(FORCES)[6:]])
 def test_forces_of_elements_are_those_of_the_kernel(names: tuple[str, ...]) -> None:
     plain = _closed(["point_on_plane"], True)
@@ -310,6 +317,55 @@ def test_forces_of_elements_are_those_of_the_kernel(names: tuple[str, ...]) -> N
     without = rate()
     for name in names:
         assert np.abs(rate(FORCES[name]) - without).max() > 1e-3, name
+
+
+def _in_frames(mechanism: srm.Mechanism) -> Iterable[dict[str, float]]:
+    """The terms at one state in the frame of the ground, and in that of each body."""
+    constants = make_system(mechanism).constants()
+    structure, parameters = structure_of(mechanism.model, constants)
+    q, v = _states(mechanism, 1)[0]
+    for frame in range(GROUND, len(structure.motions)):
+        terms = record_terms(structure, frame)
+        roots = [output.value for output in terms.outputs]
+        leaves = {
+            node: float(node.text != "held")  # a law over time is 1
+            for node in live_nodes(roots)
+            if node.operation == "leaf"
+        }
+        given = zip([*terms.q, *terms.v, *terms.parameters], [*q, *v, *parameters])
+        leaves |= {leaf: float(value) for leaf, value in given if leaf.text}
+        targets = [output.target for output in terms.outputs]
+        yield dict(zip(targets, values_of(roots, leaves)))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        *(partial(_tree, *(JOINTS[name] for name in names)) for names in TREES),
+        lambda: replace(
+            _closed(CLOSURES, False),
+            forces=[replace(FORCES[name], name=name) for name in FORCES_ON_BODIES],
+        ),
+    ],
+)
+def test_terms_are_the_same_in_the_frame_of_any_body(make: Callable[[], srm.Mechanism]) -> None:
+    expected, *others = _in_frames(make())
+    assert len(others) >= 3
+    for found in others:
+        assert found.keys() == expected.keys()
+        for target, value in expected.items():
+            assert abs(found[target] - value) < 1e-12 * max(abs(value), 10.0), target
+
+
+@pytest.mark.parametrize(
+    ("name", "frame"), [("bricard", 1), ("stewart_platform", 0), ("squeezing_mechanism", GROUND)]
+)
+def test_the_frame_is_in_the_middle_of_a_chain_or_that_of_a_free_body(
+    name: str, frame: int
+) -> None:
+    mechanism = load(name)
+    structure, _ = structure_of(mechanism.model, make_system(mechanism).constants())
+    assert shortest_terms(structure).frame == frame
 
 
 def test_points_of_a_rod_that_coincide_are_refused_as_by_the_kernel() -> None:

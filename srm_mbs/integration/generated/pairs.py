@@ -24,10 +24,9 @@ from srm_mbs.integration.generated.expressions import (
     roots_of,
 )
 
-LEAST_SAVED = 0.2
-"""Part of the operations that pairs save at least: where they save little, moving numbers into lanes
-and out of them costs as much."""
-
+LEAST_SAVED = 0.05
+"""Part of the operations that pairs save at least: few are not worth the moves of numbers into
+lanes and out of them."""
 _FIRST = ("g", "bias", "G")
 """Outputs that are paired first: rows tie several bodies, and thereby the pairs of all of them."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import textwrap
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from srm_mbs.integration.generated.cells import LOOP_INDEX, PLACES, Loop, split_cells
@@ -84,10 +84,9 @@ class _Names:
 
     def operation_of_pair(self, pair: Pair) -> str:
         """The operation of both nodes, whose operands have names together."""
-        operation = pair.first.operation
-        if operation in _INFIX or operation == "negate":
-            both = zip(pair.first.operands, pair.second.operands)
-            return _operation(operation, [str(self.of_pair(a, b)) for a, b in both])
+        if _of_vectors(pair):
+            operands = zip(pair.first.operands, pair.second.operands)
+            return _operation(pair.first.operation, [str(self.of_pair(*both)) for both in operands])
         return f"{{{self.operation(pair.first)}, {self.operation(pair.second)}}}"
 
 
@@ -99,6 +98,23 @@ def _operation(operation: str, names: Sequence[str]) -> str:
     if operation == "choose":
         return f"{names[0]} != 0.0 ? {names[1]} : {names[2]}"
     return f"{operation}({', '.join(names)})"
+
+
+def _of_vectors(pair: Pair) -> bool:
+    """Whether C has the operation of a pair for vectors; of others it computes each lane, and reads
+    of a choice what it takes alone."""
+    return pair.first.operation in _INFIX or pair.first.operation == "negate"
+
+
+def _gather(pair: Pair, names: _Names) -> Iterator[str]:
+    """Statements that put together operands of a pair that have no name together yet."""
+    if not _of_vectors(pair):
+        return
+    for both in zip(pair.first.operands, pair.second.operands):
+        if names.of_pair(*both) is None:
+            name = f"g{both[0].number}_{both[1].number}"
+            yield f"  const pair {name} = {{{names.of(both[0])}, {names.of(both[1])}}};"
+            names.give_pair(both, name)
 
 
 def _turn_together(
@@ -186,13 +202,7 @@ def _write_block(
                 terms.append(f"  const double {own} = {names.operation(node)};")
                 names.give(node, own)
             else:
-                for both in zip(pair.first.operands, pair.second.operands):
-                    if names.of_pair(*both) is None:
-                        gathered = f"g{both[0].number}_{both[1].number}"
-                        terms.append(
-                            f"  const pair {gathered} = {{{', '.join(map(names.of, both))}}};"
-                        )
-                        names.give_pair(both, gathered)
+                terms.extend(_gather(pair, names))
                 terms.append(f"  const pair {own} = {names.operation_of_pair(pair)};")
                 names.give_pair(pair, own)
                 for lane, lane_node in enumerate(pair):

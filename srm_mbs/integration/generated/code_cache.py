@@ -40,11 +40,21 @@ log = get_logger(__name__)
 
 # Products and sums are fused, which rounds once instead of twice; nothing else is allowed that
 # changes a result.  Thousands of statements without a branch have few common subexpressions between
-# blocks; and GCC's register allocator, which takes half of the time there, need not weigh each
-# spill against hundreds of others.  Clang warns of what it does not know of these two.
+# blocks; GCC's register allocator, which takes a third of the time there, need not weigh each spill
+# against hundreds of others; nor do its searches for equal loads and dead stores find more where
+# they look past hundreds of stores, which each of them would do for each load (a quarter of the
+# time).  Clang warns of what it does not know of these.
+_SEARCHES = {
+    "lra-max-considered-reload-pseudos": 20,
+    "max-cselib-memory-locations": 100,
+    "sccvn-max-alias-queries-per-access": 100,
+    "dse-max-alias-queries-per-store": 10,
+    "max-dse-active-local-stores": 50,
+}
 FLAGS = (
     *("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno"),
-    *("-fno-gcse", "--param", "lra-max-considered-reload-pseudos=20"),
+    "-fno-gcse",
+    *[text for name, most in _SEARCHES.items() for text in ("--param", f"{name}={most}")],
 )
 # Terms are scalars, of which a compiler finds pairs but hardly fours: to put these together takes
 # more instructions than it saves.  The algebra names the vectors that it has.

@@ -9,7 +9,7 @@ out, and the same operation on the same operands is the same node.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, Union
 
 CONSTANT, PARAMETER, VARIABLE = range(3)
@@ -235,9 +235,18 @@ def roots_of(outputs: Iterable[Output], guards: Iterable[Guard]) -> list[Express
     return tested + [output.value for output in outputs]
 
 
-def live_nodes(roots: Iterable[Expression], done: set[int] | None = None) -> list[Expression]:
-    """The nodes that ``roots`` need, each after its operands, but those ``done``, which grow."""
+def live_nodes(
+    roots: Iterable[Expression],
+    done: set[int] | None = None,
+    together: Mapping[int, Sequence[Expression]] | None = None,
+) -> list[Expression]:
+    """The nodes that ``roots`` need, each after its operands, but those ``done``, which grow.
+
+    Of nodes that are computed ``together``, by the number of each, there is the first one, after
+    the operands of all.
+    """
     done = set() if done is None else done
+    together = {} if together is None else together
     out: list[Expression] = []
     for root in roots:
         stack = [(root, False)]
@@ -245,10 +254,12 @@ def live_nodes(roots: Iterable[Expression], done: set[int] | None = None) -> lis
             node, ready = stack.pop()
             if node.number in done:
                 continue
+            nodes = together.get(node.number, (node,))
             if ready or not node.operands:
-                done.add(node.number)
-                out.append(node)
+                done.update(own.number for own in nodes)
+                out.append(nodes[0])
                 continue
             stack.append((node, True))
-            stack.extend((operand, False) for operand in reversed(node.operands))
+            for own in reversed(nodes):
+                stack.extend((operand, False) for operand in reversed(own.operands))
     return out

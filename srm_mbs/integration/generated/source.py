@@ -125,6 +125,10 @@ _TEMPLATE = """\
  * the bodies of bushings. */
 #include <math.h>
 #include <string.h>
+
+/* Two equal operations at once; their constants are neighbours. */
+typedef double pair __attribute__((vector_size(16)));
+typedef double pair_at __attribute__((vector_size(16), aligned(8), may_alias));
 {turns}
 const int srm_mbs_sizes[] = {{{sizes}}};
 

@@ -14,11 +14,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs._typing import FloatArray
+from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.model.model_data import joint_type_data
 
 ROUNDING = 2.0**-52
-"""Part of a rotation's unit, or of a body's moments, that is rounding."""
+"""Part of a body's moments that is rounding."""
+ROTATION_ROUNDING = 4.0 * ROUNDING
+"""Part of a rotation's unit that is rounding: files give placements as products of rotations."""
+SMALLEST_LIMB = 4
+"""Motions of limbs that are matched, at least."""
+MOST_DIFFERENT = 0.1
+"""Part of the numbers of two limbs that are of another kind in one of them, at most."""
 ZERO, ONE, MINUS_ONE, OTHER = range(4)
 """Codes of numbers."""
 
@@ -157,7 +163,8 @@ class Structure(NamedTuple):
     Attributes
     ----------
     codes
-        ZERO, ONE, MINUS_ONE or OTHER for each number of the vector of parameters.
+        ZERO, ONE, MINUS_ONE or OTHER, which may be any, for each number of the vector of
+        parameters.
     bodies
         Number of the motion that carries the body of each joint of the model; -1 for the ground.
     bushing_joints, bushing_columns
@@ -313,7 +320,7 @@ _UNTURNED = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 def _rounded(x: float) -> float:
     """An entry of a rotation without what is rounding of 0, 1 or -1."""
     nearest = round(x)
-    return float(nearest) if abs(x - nearest) <= ROUNDING else float(x)
+    return float(nearest) if abs(x - nearest) <= ROTATION_ROUNDING else float(x)
 
 
 def _inertia(body: pin.Inertia) -> list[float]:
@@ -381,7 +388,55 @@ def structure_of(model: pin.Model, constants: Mapping[str, Any]) -> tuple[Struct
     # In the order in which they are met, as generated.cpp's caller has them.
     fields["bushing_joints"] = tuple(dict.fromkeys(joint for joint in joints if joint))
     fields["bushing_columns"] = tuple(sorted(columns))
-    return Structure(codes=numbers.codes(), **fields), np.array(numbers.values, dtype=float)
+    codes = _matched(motions, numbers.codes())
+    return Structure(codes=codes, **fields), np.array(numbers.values, dtype=float)
+
+
+def _matched(motions: Sequence[Motion], codes: bytes) -> bytes:
+    """The codes, where limbs that nearly have the same have the same.
+
+    Two neighbours with equal joints, as the legs of a robot, may differ in few zeros: one has a
+    rotation where the other has none.  With OTHER for these, all their operations are equal
+    (:mod:`srm_mbs.integration.generated.pairs`).
+    """
+    children: list[list[int]] = [[] for _ in motions]
+    for i, motion in enumerate(motions):
+        if motion.parent >= 0:
+            children[motion.parent].append(i)
+    numbers_of_forms: dict[tuple[object, ...], int] = {}
+    forms, sizes = [0] * len(motions), [1] * len(motions)
+    siblings: dict[tuple[int, int], list[int]] = {}
+    for i in reversed(range(len(motions))):
+        own = motions[i]
+        # Sums divide by masses: those are equal, or none.
+        form = (own.kind, codes[own.inertia.start], *[forms[child] for child in children[i]])
+        forms[i] = numbers_of_forms.setdefault(form, len(numbers_of_forms))
+        sizes[i] += sum(sizes[child] for child in children[i])
+        if sizes[i] >= SMALLEST_LIMB:
+            siblings.setdefault((own.parent, forms[i]), []).insert(0, i)
+    out = np.frombuffer(codes, dtype=np.uint8).copy()
+    for alike in siblings.values():
+        for pair in zip(alike[::2], alike[1::2]):
+            one, other = (_comparable(limb, motions, children) for limb in pair)
+            differ = out[one] != out[other]
+            if np.count_nonzero(differ) <= MOST_DIFFERENT * len(one):
+                out[one[differ]] = out[other[differ]] = OTHER
+    return out.tobytes()
+
+
+def _comparable(
+    limb: int, motions: Sequence[Motion], children: Sequence[Sequence[int]]
+) -> IndexArray:
+    """Places of the numbers of a limb, depth first, without the masses."""
+    places: list[int] = []
+    left = [limb]
+    while left:
+        own = motions[left[-1]]
+        left[-1:] = children[left[-1]]
+        for start, length in (own.axis, own.placement):
+            places += range(start, start + length)
+        places += range(own.inertia.start + 1, own.inertia.start + own.inertia.length)
+    return np.array(places)
 
 
 def parameters_of_variant(

@@ -1,12 +1,14 @@
 """Recorded expressions as C: statements in static single assignment, and loops over equal cells.
 
+Pairs of equal operations are one statement of vectors (:mod:`srm_mbs.integration.generated.pairs`).
 Nodes that depend on parameters alone are computed once per mechanism, in a function of their own.
 """
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from srm_mbs.integration.generated.cells import LOOP_INDEX, PLACES, Loop, split_cells
@@ -19,6 +21,7 @@ from srm_mbs.integration.generated.expressions import (
     live_nodes,
     roots_of,
 )
+from srm_mbs.integration.generated.pairs import Pair, find_pairs
 
 
 class Written(NamedTuple):
@@ -52,40 +55,78 @@ def _literal(value: float) -> str:
 
 
 class _Names:
-    """How C reads each node."""
+    """How C reads each node, and pairs of nodes."""
 
     def __init__(self) -> None:
         self._names: dict[int, str] = {}
+        self._pairs: dict[tuple[Expression, Expression], str] = {}
 
     def give(self, node: Expression, name: str) -> None:
         self._names[node.number] = name
+
+    def give_pair(self, pair: tuple[Expression, Expression], name: str) -> None:
+        self._pairs[pair] = name
 
     def of(self, node: Expression) -> str:
         if node.operation == "constant":
             return _literal(node.value)
         return self._names.get(node.number, node.text)
 
+    def of_pair(self, first: Expression, second: Expression) -> str | None:
+        """A vector of both, or their common number; None where they have no name together."""
+        return self.of(first) if first is second else self._pairs.get((first, second))
+
     def operation(self, node: Expression) -> str:
         """The operation of ``node`` in C."""
         if not node.operands:
             return self.of(node)
-        names = [self.of(operand) for operand in node.operands]
-        if node.operation in _INFIX:
-            return f"{names[0]} {node.operation} {names[1]}"
-        if node.operation == "negate":
-            return f"-{names[0]}"
-        if node.operation == "choose":
-            return f"{names[0]} != 0.0 ? {names[1]} : {names[2]}"
-        return f"{node.operation}({', '.join(names)})"
+        return _operation(node.operation, [self.of(operand) for operand in node.operands])
+
+    def operation_of_pair(self, pair: Pair) -> str:
+        """The operation of both nodes, whose operands have names together."""
+        if _of_vectors(pair):
+            operands = zip(pair.first.operands, pair.second.operands)
+            return _operation(pair.first.operation, [str(self.of_pair(*both)) for both in operands])
+        return f"{{{self.operation(pair.first)}, {self.operation(pair.second)}}}"
 
 
-def _turn_together(live: Sequence[Expression], names: _Names) -> tuple[list[str], set[int]]:
+def _operation(operation: str, names: Sequence[str]) -> str:
+    if operation in _INFIX:
+        return f"{names[0]} {operation} {names[1]}"
+    if operation == "negate":
+        return f"-{names[0]}"
+    if operation == "choose":
+        return f"{names[0]} != 0.0 ? {names[1]} : {names[2]}"
+    return f"{operation}({', '.join(names)})"
+
+
+def _of_vectors(pair: Pair) -> bool:
+    """Whether C has the operation of a pair for vectors; of others it computes each lane, and reads
+    of a choice what it takes alone."""
+    return pair.first.operation in _INFIX or pair.first.operation == "negate"
+
+
+def _gather(pair: Pair, names: _Names) -> Iterator[str]:
+    """Statements that put together operands of a pair that have no name together yet."""
+    if not _of_vectors(pair):
+        return
+    for both in zip(pair.first.operands, pair.second.operands):
+        if names.of_pair(*both) is None:
+            name = f"g{both[0].number}_{both[1].number}"
+            yield f"  const pair {name} = {{{names.of(both[0])}, {names.of(both[1])}}};"
+            names.give_pair(both, name)
+
+
+def _turn_together(
+    live: Sequence[Expression], names: _Names, pairs: Mapping[int, Pair]
+) -> tuple[list[str], set[int]]:
     """Statements with the sines and cosines of leaves, of several at a time, and their nodes."""
     turning = [node for node in live if node.operation in ("sin", "cos")]
     turning = [node for node in turning if node.operands[0].operation == "leaf"]
-    places = {
-        number: place for place, number in enumerate({n.operands[0].number: 0 for n in turning})
-    }
+    # Those of a pair are neighbours.
+    joined = [node for own in turning if own.number in pairs for node in pairs[own.number]]
+    angles_of = dict.fromkeys(node.operands[0].number for node in (*joined, *turning))
+    places = {number: place for place, number in enumerate(angles_of)}
     if len(places) < 2:
         return [], set()
     angles = ["0.0"] * (-(-len(places) // TURNED_TOGETHER) * TURNED_TOGETHER)
@@ -143,41 +184,91 @@ def _write_block(
     outputs: Sequence[Output], guards: Sequence[Guard], names: _Names, constants_in: str
 ) -> Written:
     """``outputs`` without loops; ``names`` has the leaves that C does not read by their texts."""
+    pairs = find_pairs(outputs, guards)
     roots = roots_of(outputs, guards)
     live = live_nodes(roots)
-    read = [o for node in live if node.depends == VARIABLE for o in node.operands] + roots
-    # Parameters and what depends on them alone, as far as the terms read it, in their order.
-    places: dict[int, int] = {}
-    for node in read:
-        if node.depends == PARAMETER:
-            places.setdefault(node.number, len(places))
-    constants = []
-    for node in live:
-        if node.depends != PARAMETER:
-            continue
-        place = places.get(node.number)
-        if place is not None:
-            constants.append(f"  {constants_in}[{place}] = {names.operation(node)};")
-            names.give(node, f"{constants_in}[{place}]")
-        elif node.operands:
-            constants.append(f"  const double c{node.number} = {names.operation(node)};")
-            names.give(node, f"c{node.number}")
-    terms, done = _turn_together(live, names)
+    constants, count_of_constants = _write_constants(live, roots, pairs, names, constants_in)
+    terms, done = _turn_together(live, names, pairs)
     count = len(outputs)
 
     def evaluate(root: Expression) -> str:
         nonlocal count
-        for node in live_nodes((root,), done):
-            if node.depends == VARIABLE and node.operands:
-                terms.append(f"  const double x{node.number} = {names.operation(node)};")
-                names.give(node, f"x{node.number}")
-                count += 1
+        for node in live_nodes((root,), done, pairs):
+            if node.depends != VARIABLE or not node.operands:
+                continue
+            own = f"x{node.number}"
+            pair = pairs.get(node.number)
+            if pair is None:
+                terms.append(f"  const double {own} = {names.operation(node)};")
+                names.give(node, own)
+            else:
+                terms.extend(_gather(pair, names))
+                terms.append(f"  const pair {own} = {names.operation_of_pair(pair)};")
+                names.give_pair(pair, own)
+                for lane, lane_node in enumerate(pair):
+                    names.give(lane_node, f"{own}[{lane}]")
+            count += 1
         return names.of(root)
 
     for guard in guards:
         value, bound = evaluate(guard.value), evaluate(guard.bound)
         terms.append(f"  if ({value} < {bound}) return 1;")
+    waiting: dict[int, list[Output]] = defaultdict(list)
     for out in outputs:
-        value = evaluate(out.value)
-        terms.append(f"  {out.target} = {value};")
-    return Written("\n".join(constants), "\n".join(terms), len(places), count)
+        waiting[out.value.number].append(out)
+    for out in outputs:
+        evaluate(out.value)
+        # A pair is stored at once, so that it need not be kept.
+        for node in pairs.get(out.value.number, (out.value,)):
+            for stored in waiting.pop(node.number, ()):
+                terms.append(f"  {stored.target} = {names.of(node)};")
+    return Written("\n".join(constants), "\n".join(terms), count_of_constants, count)
+
+
+def _write_constants(
+    live: Sequence[Expression],
+    roots: Sequence[Expression],
+    pairs: Mapping[int, Pair],
+    names: _Names,
+    constants_in: str,
+) -> tuple[list[str], int]:
+    """Statements with parameters and what depends on them alone, as far as the terms read it, and
+    the length of their array, in which those of pairs are neighbours."""
+    places: dict[int, list[int]] = defaultdict(list)
+    alone: dict[int, None] = {}
+    count = 0
+    for node in live:
+        if node.depends != VARIABLE:
+            continue
+        pair = pairs.get(node.number)
+        if pair is None:
+            alone |= dict.fromkeys(o.number for o in node.operands if o.depends == PARAMETER)
+            continue
+        for both in zip(pair.first.operands, pair.second.operands):
+            if both[0].depends != PARAMETER:
+                continue
+            if both[0] is both[1]:
+                alone[both[0].number] = None
+            elif names.of_pair(*both) is None:
+                names.give_pair(both, f"*(const pair_at *)({constants_in} + {count})")
+                for operand in both:
+                    places[operand.number].append(count)
+                    count += 1
+    alone |= dict.fromkeys(root.number for root in roots if root.depends == PARAMETER)
+    for number in alone:
+        if number not in places:
+            places[number].append(count)
+            count += 1
+    statements = []
+    for node in live:
+        if node.depends != PARAMETER:
+            continue
+        if node.number in places:
+            first, *others = (f"{constants_in}[{place}]" for place in places[node.number])
+            statements.append(f"  {first} = {names.operation(node)};")
+            statements += [f"  {other} = {first};" for other in others]
+            names.give(node, first)
+        elif node.operands:
+            statements.append(f"  const double c{node.number} = {names.operation(node)};")
+            names.give(node, f"c{node.number}")
+    return statements, count

@@ -253,6 +253,43 @@ def test_elements_of_equal_cells_are_computed_in_a_loop() -> None:
     _agree(mechanism, count=2)
 
 
+def _two_legs(bent: float) -> srm.Mechanism:
+    """A free body on two legs that are mirrored, with a rod and a spring for each; the shin of the
+    second one is turned by an angle (rad) against its thigh."""
+    model = pin.Model()
+    pelvis = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "pelvis")
+    model.appendBodyToJoint(pelvis, rod(), pin.SE3.Identity())
+    model.addBodyFrame("pelvis", pelvis, pin.SE3.Identity(), 0)
+    kinds = pin.JointModelRX, pin.JointModelRY, pin.JointModelRY, pin.JointModelRZ
+    loops, springs = [], []
+    for name, side in (("left", 1.0), ("right", -1.0)):
+        joint = pelvis
+        for i, kind in enumerate(kinds):
+            turn = pin.rpy.rpyToMatrix(0.0, bent if i == 2 and side < 0.0 else 0.0, 0.0)
+            at = pin.SE3(turn, np.array([0.05, 0.1 * side, -0.3]))
+            joint = model.addJoint(joint, kind(), at, f"{name}_{i}")
+            inertia = pin.Inertia(1.0 + i, np.array([0.02, 0.01 * side, -0.1]), 0.1 * np.eye(3))
+            model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
+            model.addBodyFrame(f"{name}_{i}", joint, pin.SE3.Identity(), 0)
+        hip, foot = (
+            srm.Anchor(body, xyz=(0.1, 0.2 * side, 0.03)) for body in ("pelvis", f"{name}_3")
+        )
+        shin = replace(foot, link=f"{name}_2")
+        springs.append(srm.SpringDamper(hip, shin, stiffness=50.0, damping=2.0, rest_length=0.6))
+        loops.append(srm.LoopClosure("distance", hip, foot, name=f"{name} rod", length=1.2))
+    return srm.Mechanism(model, loops, forces=springs, q0=pin.neutral(model))
+
+
+def test_two_legs_are_computed_together_although_one_has_more_zeros() -> None:
+    """Of legs that differ in numbers alone and, with a shin at an angle, in zeros as well."""
+    equal, unequal = _two_legs(0.0), _two_legs(0.3)
+    pairs = [generated_source(own).count("const pair x") for own in (equal, unequal)]
+    singles = generated_source(unequal).count("const double x")
+    assert min(pairs) > 300
+    assert pairs[1] > singles
+    _agree(unequal)
+
+
 @pytest.mark.parametrize("name", COMPILED_MODELS)
 def test_evaluations_of_bundled_mechanisms_are_those_of_the_kernel(name: str) -> None:
     _agree(load(name))

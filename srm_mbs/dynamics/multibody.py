@@ -235,6 +235,7 @@ class Mechanics(Manifold):
 
     carries_yhat = True
     predicts = True
+    sigma_scatters = False
     residual_scale = np.zeros(0)
     """Factor (m,) from each scaled row in use to row units."""
 
@@ -611,6 +612,7 @@ class ClosedSystem(Mechanics):
         self.driven = bool(mechanism.drives)
         self.residual_scale = _residual_scale(mechanism)
         self._order = _graph_order(mechanism)
+        self.sigma_scatters = bool(self._order)
         self.projection = Projection(structure.rank, structure.sigma_ref, self._order)
 
     @cached_property

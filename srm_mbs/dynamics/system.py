@@ -181,6 +181,8 @@ class System(Protocol):
     """Whether sweeps carry yhat, which the zone replaces next to a singular configuration."""
     predicts: bool
     """Whether the exact multiplier is known: False for a DAE whose g_t is needed and not given."""
+    sigma_scatters: bool
+    """Whether sigma jumps when other pivots are taken, along the graph of many loops."""
 
     @property
     def wraps(self) -> bool:

@@ -182,6 +182,8 @@ public:
 
     // Terms of the stage evaluated last.
     bool constrained() const { return closed_; }
+    // Whether sigma jumps when other pivots are taken.
+    bool sigma_scatters() const { return !data_.order.empty(); }
     bool sparse() const { return closed_ && projection_->sparse(); }
     double sigma() const;
     int rank() const;

@@ -205,7 +205,7 @@ public:
     // M-orthonormal velocities (k, nv) that satisfy the closures, whatever the drives; their number.
     // `rates` (k, drives), if asked for: those of the drives along them.
     int branch_tangents(std::vector<double>& out, std::vector<double>* rates = nullptr) const;
-    // M-orthonormal normals (k, nv) of the rows in use; empty with drives.
+    // M-orthonormal normals (k, nv) of the weakest rows in use; empty with drives.
     void normals(std::vector<double>& out) const;
 
     // The manifold.

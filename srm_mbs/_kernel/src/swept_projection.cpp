@@ -288,7 +288,7 @@ void SweptProjection::reflect(const int* at, double* v, int n) {
     v[0] = beta;
 }
 
-// Applies 1 - tau v v^T with v = (1, second) to two rows, the first of which is that of the pivot, as
+// Applies 1 - tau v v^T with v = (1, second) to two rows, the first that of the pivot, as
 // most reflections do, where it changes more than negligible parts of columns.
 void SweptProjection::reflect_pair(int one, int two, double second, double tau) {
     double *const a = row(one), *const b = row(two);

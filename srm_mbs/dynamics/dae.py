@@ -223,6 +223,7 @@ class DaeSystem:
     """
 
     has_constraints = True
+    sigma_scatters = False
     time_dependent = True
     laws = np.zeros(0)
     singularities = None

@@ -136,7 +136,7 @@ class ClosedTerms:
         return self._p.held is not None
 
     def normals(self) -> FloatArray:
-        return np.zeros((self.v.size, 0)) if self._system.driven else self._p.normals()
+        return np.zeros((self.v.size, 0)) if self._system.driven else self._p.weak_normals()
 
     def rate(self) -> FloatArray:
         p = self._p
@@ -235,6 +235,7 @@ class Mechanics(Manifold):
 
     carries_yhat = True
     predicts = True
+    sigma_scatters = False
     residual_scale = np.zeros(0)
     """Factor (m,) from each scaled row in use to row units."""
 
@@ -611,6 +612,7 @@ class ClosedSystem(Mechanics):
         self.driven = bool(mechanism.drives)
         self.residual_scale = _residual_scale(mechanism)
         self._order = _graph_order(mechanism)
+        self.sigma_scatters = bool(self._order)
         self.projection = Projection(structure.rank, structure.sigma_ref, self._order)
 
     @cached_property
@@ -729,7 +731,8 @@ class ClosedSystem(Mechanics):
         if projection.rank_deficient and zone is not None:
             predicted = zone.predict(t)
             if predicted is None:
-                if zone.normals is None:
+                missing = projection.structural_rank - projection.rank
+                if zone.normals is None or zone.normals.shape[1] < missing:
                     raise EvaluationError(
                         "the motion stays next to a singular configuration with too little "
                         "momentum to tell its branch"

@@ -75,8 +75,8 @@ class Terms(Protocol):
         """Whether the normals of the zone replace the dropped rows."""
 
     def normals(self) -> FloatArray:
-        """M-orthonormal normals of the closures (nv, rank), the weakest last; (nv, 0) with drives,
-        which move the mechanism along them: it cannot be held tangential then."""
+        """M-orthonormal normals (nv, k) of the weakest closures, that of the weakest last; (nv, 0)
+        with drives, which move the mechanism along them: it cannot be held tangential then."""
 
     def rate(self) -> FloatArray:
         """Tangent rate (2 nv,): (v, M^-1 f - yhat)."""
@@ -181,6 +181,8 @@ class System(Protocol):
     """Whether sweeps carry yhat, which the zone replaces next to a singular configuration."""
     predicts: bool
     """Whether the exact multiplier is known: False for a DAE whose g_t is needed and not given."""
+    sigma_scatters: bool
+    """Whether sigma jumps when other pivots are taken, along the graph of many loops."""
 
     @property
     def wraps(self) -> bool:

@@ -598,8 +598,8 @@ def placed_control(
     else:
         control = FixedStep(options.t0, t_end, step)
     placement = options.placement if system.has_constraints else None
-    times = options.singular_times
-    control, wrappers = placed(control, scheme, placement, times, t_end, step, arrivals)
+    times, scatters = options.singular_times, system.sigma_scatters
+    control, wrappers = placed(control, scheme, placement, times, t_end, step, arrivals, scatters)
     if placement != "automatic":
         return control, wrappers
     guard = branch_guard(control, system, options.method)

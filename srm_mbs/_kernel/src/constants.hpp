@@ -76,6 +76,7 @@ namespace srm {
     field(double, longest_first_step)      /* over the probing step */                             \
     /* Placement: control/placement.py. */                                                         \
     field(double, max_sigma_change)        /* per step */                                          \
+    field(double, scatter_from)            /* least abscissa of slopes of a sigma that jumps */        \
     field(double, too_close)               /* sigma of a stage, over slope times step */           \
     field(double, clearance)               /* from abscissae, over half the widest gap */          \
     field(double, zero_horizon)            /* steps within which zeros of sigma are predicted */   \

@@ -19,12 +19,12 @@ std::vector<double> with_end(const ButcherTableau& scheme) {
     return out;
 }
 
-// max_j |sigma_j - sigma_0| / (c_j h) over the stages (1/s).
+// max_j |sigma_j - sigma_0| / (c_j h) over the stages with c_j >= from (1/s).
 double sigma_slope(const std::vector<double>& abscissae, const std::vector<double>& sigmas,
-                   double h) {
+                   double h, double from = 0.0) {
     double out = 0.0;
     for (std::size_t j = 0; j < sigmas.size(); ++j)
-        if (abscissae[j] > 0.0)
+        if (abscissae[j] > 0.0 && abscissae[j] >= from)
             out = std::max(out, std::abs(sigmas[j] - sigmas[0]) * (1.0 / abscissae[j]));
     return out / h;
 }
@@ -114,10 +114,11 @@ bool Gaps::ends_on(double distance, double h) const {
 
 double Gaps::step_over(double distance) const { return distance / wide_ends_.back(); }
 
-StagePlaces::StagePlaces(const ButcherTableau& scheme, double clearance)
+StagePlaces::StagePlaces(const ButcherTableau& scheme, double clearance, double slope_from)
     : gaps(scheme, clearance),
       abscissae(with_end(scheme)),
       middle(0),
+      slope_from(slope_from),
       explicit_scheme(scheme.implicit.empty()) {
     for (std::size_t k = 1; k < abscissae.size(); ++k)
         if (std::abs(abscissae[k] - 0.5) < std::abs(abscissae[middle] - 0.5))
@@ -127,13 +128,15 @@ StagePlaces::StagePlaces(const ButcherTableau& scheme, double clearance)
 SingularityPlacement::SingularityPlacement(std::unique_ptr<Control> inner,
                                            const ButcherTableau& scheme,
                                            const ButcherTableau& stiff, double t_end,
-                                           const Constants& constants, bool arrivals)
+                                           const Constants& constants, bool arrivals,
+                                           bool scatters)
     : ControlWrapper(std::move(inner)),
       constants_(constants),
       t_end_(t_end),
       first_arrival_(arrivals && inner_->adaptive ? Arrival::watched : Arrival::none),
       arrival_(first_arrival_),
-      members_{{scheme, constants.clearance}, {stiff, constants.clearance}},
+      members_{{scheme, constants.clearance, scatters ? constants.scatter_from : 0.0},
+               {stiff, constants.clearance, scatters ? constants.scatter_from : 0.0}},
       zero_(nan) {}
 
 Proposal SingularityPlacement::propose(double t, double limit, IntegratorState& memory) {
@@ -222,7 +225,7 @@ StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepRe
         slope = std::max(std::abs(sigmas.back() - start),
                          c > 0.0 ? std::abs(sigmas[middle] - start) / c : 0.0) / h;
     } else if (result) {
-        slope = sigma_slope(abscissae, result->sigmas, h);
+        slope = sigma_slope(abscissae, result->sigmas, h, places_->slope_from);
         if (lingering_ && result->lost_branch) {
             lost_branch_ = true;
             redo_ = h;

@@ -158,11 +158,12 @@ protected:
 
 // Where the stages of a scheme lie in a step.
 struct StagePlaces {
-    StagePlaces(const ButcherTableau& scheme, double clearance);
+    StagePlaces(const ButcherTableau& scheme, double clearance, double slope_from);
 
     Gaps gaps;
     std::vector<double> abscissae;
-    int middle;  // stage next to the middle of the step
+    int middle;         // stage next to the middle of the step
+    double slope_from;  // least abscissa by which sigma has a slope
     bool explicit_scheme;
 };
 
@@ -171,7 +172,7 @@ class SingularityPlacement : public ControlWrapper {
 public:
     SingularityPlacement(std::unique_ptr<Control> inner, const ButcherTableau& scheme,
                          const ButcherTableau& stiff, double t_end, const Constants& constants,
-                         bool arrivals);
+                         bool arrivals, bool scatters);
     Proposal propose(double t, double limit, IntegratorState& memory) override;
     StepDecision decide(const Proposal& proposal, const StepResult* result) override;
     void set_target_time(double end) override {

@@ -1032,7 +1032,8 @@ struct PyRun {
         if (options.placement != "automatic")
             return std::make_unique<SlopeOfSigma>(std::move(control), scheme, stiff);
         control = std::make_unique<SingularityPlacement>(std::move(control), scheme, stiff, t_end,
-                                                         constants, options.arrivals);
+                                                         constants, options.arrivals,
+                                                         s.sigma_scatters());
         auto outer = std::make_unique<BranchGuard>(std::move(control), s, constants);
         guard = outer.get();
         return outer;

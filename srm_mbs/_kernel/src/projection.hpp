@@ -49,6 +49,11 @@ public:
     virtual void unwhiten(double* x) const = 0;
     // M-orthonormal normals L^-T Q (rank, nv), that of the smallest pivot last.
     virtual void normals(double* out) const = 0;
+    // The last of them (k, nv), at least those whose pivots are below sigma_ref.
+    virtual void weak_normals(std::vector<double>& out) const {
+        out.resize(static_cast<std::size_t>(rank) * nv);
+        normals(out.data());
+    }
     // Orthonormal white vectors (nv - rank, nv), orthogonal to the rows in use.
     virtual void complement(double* out) const = 0;
     // |R_kk| (structural rank,) in the order of the pivots, and the squares of W's columns (rows,).

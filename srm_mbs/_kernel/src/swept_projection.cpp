@@ -288,8 +288,8 @@ void SweptProjection::reflect(const int* at, double* v, int n) {
     v[0] = beta;
 }
 
-// Applies 1 - tau v v^T with v = (1, second) to two rows, as most reflections do, where it changes
-// more than negligible parts of columns.
+// Applies 1 - tau v v^T with v = (1, second) to two rows, the first that of the pivot, as
+// most reflections do, where it changes more than negligible parts of columns.
 void SweptProjection::reflect_pair(int one, int two, double second, double tau) {
     double *const a = row(one), *const b = row(two);
     const double* const least = small_.data();
@@ -307,7 +307,8 @@ void SweptProjection::reflect_pair(int one, int two, double second, double tau) 
             b[j] -= second * along;
             changed |= Word{1} << (j & 63);
         });
-        enter(one, changed, w);
+        // The row of the pivot, which closes, needs no column to know it.
+        columns_of_.add(one, changed, w);
         enter(two, changed, w);
     }
 }
@@ -339,9 +340,10 @@ void SweptProjection::reflect_rows(const int* at, const double* v, int n, double
             changed |= Word{kept} << j;
         }
         if (!changed) continue;
+        columns_of_.add(at[0], changed << gap, w);  // as in reflect_pair()
         for (int c = 0; c < n; ++c) {
             add(-v[c], along, row(at[c]) + start, count);
-            enter(at[c], changed << gap, w);
+            if (c > 0) enter(at[c], changed << gap, w);
         }
     }
 }
@@ -398,22 +400,38 @@ double SweptProjection::smallest_pivot() const {
     return *std::min_element(pivots_.begin(), pivots_.end());
 }
 
-void SweptProjection::normals(double* out) const {
+// Pivots in the order of their size, the smallest last.
+void SweptProjection::sort_pivots() const {
     std::iota(by_pivot_.begin(), by_pivot_.begin() + rank, 0);
     std::stable_sort(by_pivot_.begin(), by_pivot_.begin() + rank,
                      [&](int a, int b) { return pivots_[a] > pivots_[b]; });
-    for (int k = 0; k < rank; ++k, out += nv) {
-        std::fill(out, out + nv, 0.0);
-        out[pivot_row_[by_pivot_[k]]] = 1.0;
-        for (int l = reflections_[by_pivot_[k] + 1] - 1; l >= 0; --l) {
-            const int start = reflection_start_[l], n = reflection_start_[l + 1] - start;
-            const int* const at = reflection_row_.data() + start;
-            const double* const v = reflection_.data() + start;
-            const double s = tau_[l] * gathered(v, at, n, out);
-            if (s != 0.0) scattered(-s, v, at, n, out);
-        }
-        unwhiten(out);
+}
+
+void SweptProjection::normal_of_pivot(int k, double* out) const {
+    std::fill(out, out + nv, 0.0);
+    out[pivot_row_[k]] = 1.0;
+    for (int l = reflections_[k + 1] - 1; l >= 0; --l) {
+        const int start = reflection_start_[l], n = reflection_start_[l + 1] - start;
+        const int* const at = reflection_row_.data() + start;
+        const double* const v = reflection_.data() + start;
+        const double s = tau_[l] * gathered(v, at, n, out);
+        if (s != 0.0) scattered(-s, v, at, n, out);
     }
+    unwhiten(out);
+}
+
+void SweptProjection::normals(double* out) const {
+    sort_pivots();
+    for (int k = 0; k < rank; ++k, out += nv) normal_of_pivot(by_pivot_[k], out);
+}
+
+void SweptProjection::weak_normals(std::vector<double>& out) const {
+    sort_pivots();
+    int first = rank;
+    while (first > 0 && pivots_[by_pivot_[first - 1]] < sigma_ref) --first;
+    out.resize(static_cast<std::size_t>(rank - first) * nv);
+    double* normal = out.data();
+    for (int k = first; k < rank; ++k, normal += nv) normal_of_pivot(by_pivot_[k], normal);
 }
 
 }  // namespace srm

@@ -23,8 +23,12 @@ public:
     SweptProjection(int structural_rank, double sigma_ref, const Pattern& pattern);
 
     void normals(double* out) const override;
+    // Not those of many other rows: each takes nv numbers.
+    void weak_normals(std::vector<double>& out) const override;
 
 private:
+    void sort_pivots() const;
+    void normal_of_pivot(int k, double* out) const;
     void pivoted_qr(double floor) override;
     double smallest_pivot() const override;
     void take_columns();

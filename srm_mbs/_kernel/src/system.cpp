@@ -1016,7 +1016,8 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     if (!p.rank_deficient || zone.history == nullptr) return;
     predicted_ = zone.predicts && zone.history->predict_near(t, prediction_.data());
     if (predicted_) return;
-    if (zone.history->normals.empty()) throw EvaluationError{Failure::no_branch};
+    if (zone.history->normal_count() < p.structural_rank - p.rank)
+        throw EvaluationError{Failure::no_branch};
     p.hold(zone.history->normals.data(), zone.history->normal_count());
 }
 
@@ -1170,9 +1171,10 @@ double System::closure_residual() const {
 
 void System::normals(std::vector<double>& out) const {
     // With drives the motion has a part along them: it cannot be held tangential.
-    const int count = data_.drives.empty() ? rank() : 0;
-    out.resize(static_cast<std::size_t>(count) * nv);
-    if (count) projection_->normals(out.data());
+    if (closed_ && data_.drives.empty())
+        projection_->weak_normals(out);
+    else
+        out.clear();
 }
 
 void System::retract(const double* state, const double* delta, double* out) {

@@ -195,6 +195,8 @@ public:
 
     // Terms of the stage evaluated last.
     bool constrained() const { return closed_; }
+    // Whether sigma jumps when other pivots are taken.
+    bool sigma_scatters() const { return !data_.order.empty(); }
     bool sparse() const { return closed_ && projection_->sparse(); }
     double sigma() const;
     int rank() const;
@@ -216,7 +218,7 @@ public:
     // M-orthonormal velocities (k, nv) that satisfy the closures, whatever the drives; their number.
     // `rates` (k, drives), if asked for: those of the drives along them.
     int branch_tangents(std::vector<double>& out, std::vector<double>* rates = nullptr) const;
-    // M-orthonormal normals (k, nv) of the rows in use; empty with drives.
+    // M-orthonormal normals (k, nv) of the weakest rows in use; empty with drives.
     void normals(std::vector<double>& out) const;
 
     // The manifold.

@@ -301,6 +301,17 @@ class Projection:
         falling = np.argsort(-self._pivots[: self.rank], kind="stable")
         return self.unwhiten(self.Q[:, falling])
 
+    def weak_normals(self) -> FloatArray:
+        """The last of :meth:`normals` (nv, k), those of rows that may lose their rank in a step.
+
+        Along the graph of many loops these are the rows with pivots below ``sigma_ref``, the usual
+        smallest one: all normals would be nv numbers for each of the rows.
+        """
+        if not self._graph_order:
+            return self.normals()
+        weak = int(np.count_nonzero(self._pivots[: self.rank] < self.sigma_ref))
+        return self.normals()[:, self.rank - weak :]
+
     def complement(self) -> FloatArray:
         """Orthonormal white vectors (nv, nv - rank), orthogonal to the rows in use."""
         return np.linalg.qr(self.Q, mode="complete")[0][:, self.rank :]

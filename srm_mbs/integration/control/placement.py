@@ -46,6 +46,10 @@ EXPECTED_SIGMA = 0.6
 """sigma below which it is examined wherever it lies."""
 SIGMA_CHANGE = 0.5
 """Largest change of sigma in one step, by the slope of the last steps."""
+SCATTER_FROM = 0.25
+"""Abscissa from which on changes of sigma count where its pivots follow the graph of the loops:
+sigma jumps there by up to a half when other pivots are taken, and a jump is no slope that an early
+stage would have found.  Of a motion through a zero the later stages still find half the slope."""
 TOO_CLOSE = 0.05
 """A stage is too close if sigma < TOO_CLOSE * slope * h, and nearer to zero than the start."""
 CLEARANCE = 0.6
@@ -208,9 +212,11 @@ class Arrival(IntEnum):
     """It does: a step that reached it was redone."""
 
 
-def inverse_abscissae(scheme: ButcherTableau) -> list[float]:
-    """1/c of the stages and the end (s + 1,); 0 where c is."""
-    return [1.0 / c if c > 0.0 else 0.0 for c in scheme.abscissae.tolist()]
+def inverse_abscissae(scheme: ButcherTableau, scatters: bool = False) -> list[float]:
+    """1/c of the stages and the end (s + 1,) by which sigma has a slope, for one that ``scatters``
+    from :data:`SCATTER_FROM` on; 0 of the others."""
+    least = SCATTER_FROM if scatters else 0.0
+    return [1.0 / c if c > 0.0 and c >= least else 0.0 for c in scheme.abscissae.tolist()]
 
 
 def sigma_slope(inverse: list[float], sigmas: FloatArray, h: float) -> float:
@@ -262,11 +268,11 @@ class Gaps:
 class StagePlaces:
     """Where the stages of a ``scheme`` lie in a step."""
 
-    def __init__(self, scheme: ButcherTableau) -> None:
+    def __init__(self, scheme: ButcherTableau, scatters: bool) -> None:
         self.gaps = Gaps(scheme)
         self.explicit = scheme.implicit is None
         self.abscissae = scheme.abscissae
-        self.inverse = inverse_abscissae(scheme)
+        self.inverse = inverse_abscissae(scheme, scatters)
         self.later_stages = np.flatnonzero(self.abscissae > 0.0).tolist()
         self.inner_stages = [j for j in self.later_stages if self.abscissae[j] < 1.0]
         self.middle = scheme.middle
@@ -283,6 +289,9 @@ class SingularityPlacement(ControlWrapper):
         End of the run (s).
     arrivals
         Whether the driver prepares for ends beside singular configurations.
+    scatters
+        Whether sigma jumps with its pivots: ``sigma_scatters`` of
+        :class:`~srm_mbs.dynamics.system.System`.
 
     ``placed`` counts the steps changed a priori, ``replaced`` those redone a posteriori.
     """
@@ -293,9 +302,12 @@ class SingularityPlacement(ControlWrapper):
         scheme: ButcherTableau,
         t_end: float = np.inf,
         arrivals: bool = False,
+        scatters: bool = False,
     ) -> None:
         super().__init__(inner, t_end)
-        self._members = tuple(StagePlaces(scheme.member(stiff)) for stiff in (False, True))
+        self._members = tuple(
+            StagePlaces(scheme.member(stiff), scatters) for stiff in (False, True)
+        )
         self._places = self._members[False]
         self._slope = 0.0
         self._zero: float | None = None

@@ -120,6 +120,7 @@ def placed(
     t_end: float,
     step: float | None = None,
     arrivals: bool = False,
+    scatters: bool = False,
 ) -> tuple[StepSizeControl, tuple[ControlWrapper, ...]]:
     """``control`` with its steps placed, and the wrappers that do it.
 
@@ -135,12 +136,12 @@ def placed(
         End of the run (s).
     step
         The step (s) if it is fixed.
-    arrivals
+    arrivals, scatters
         As for :class:`~srm_mbs.integration.control.placement.SingularityPlacement`.
     """
     wrappers: list[ControlWrapper] = []
     if placement == "automatic":
-        wrappers.append(SingularityPlacement(control, scheme, t_end, arrivals))
+        wrappers.append(SingularityPlacement(control, scheme, t_end, arrivals, scatters))
     elif placement == "halved":
         wrappers.append(HalvedStep(control, scheme, t_end))
     elif placement == "off":

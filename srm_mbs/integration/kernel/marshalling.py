@@ -125,6 +125,7 @@ def constants() -> Any:
         longest_first_step=step_size.LONGEST_FIRST,
         # Placement.
         max_sigma_change=placement.SIGMA_CHANGE,
+        scatter_from=placement.SCATTER_FROM,
         too_close=placement.TOO_CLOSE,
         clearance=placement.CLEARANCE,
         zero_horizon=placement.PREDICTION_STEPS,

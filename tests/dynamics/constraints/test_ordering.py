@@ -120,3 +120,11 @@ def test_the_weakest_normal_is_the_last() -> None:
     others = np.linalg.qr(np.delete(W, 7, axis=1))[0]
     own = W[:, 7] - others @ (others.T @ W[:, 7])
     assert abs(p.normals()[:, -1] @ own) > 0.99 * np.linalg.norm(own)
+
+
+def test_weak_normals_are_those_of_pivots_below_the_usual_smallest_one() -> None:
+    W = white(20, 0.5)
+    W[:, [7, 20]] *= 1e-3
+    p = Projection(40, 0.002, tuple(range(40)))
+    p.factor(np.eye(41), W.T, np.zeros(41), np.zeros(40), None)
+    np.testing.assert_array_equal(p.weak_normals(), p.normals()[:, -2:])

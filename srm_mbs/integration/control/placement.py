@@ -35,6 +35,7 @@ from srm_mbs.integration.control.step_size import (
     StepSizeControl,
 )
 from srm_mbs.integration.methods.base import IntegratorState, StepResult
+from srm_mbs.integration.methods.branch_nodes import BRANCH_SIGMA
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.near_singular import WATCHED_SIGMA
 
@@ -321,10 +322,12 @@ class SingularityPlacement(ControlWrapper):
             if longest < limit:
                 limit = longest
         proposal = self._inner.propose(t, limit, memory)
+        if self._arrives(t, proposal):
+            self._arrival = Arrival.DUE
         self._lingering = memory.lingering = self._lingers(proposal, memory)
         if self._lingering:
             return proposal
-        if self._arrives(t, proposal):
+        if self._arrival is Arrival.DUE:
             self._arrival = Arrival.NONE
             return replace(proposal, singular_arrival=True)
         # Where the multipliers are known, stages may lie anywhere.
@@ -363,6 +366,8 @@ class SingularityPlacement(ControlWrapper):
             return False
         if not self.adaptive:
             return history.away is not None
+        if self._arrival is Arrival.DUE:
+            return True
         if not memory.sigma < WATCHED_SIGMA:
             return False
         # Where nodes solved the last state, sigma at stages off the branch need not be a parabola.
@@ -371,7 +376,7 @@ class SingularityPlacement(ControlWrapper):
     def _arrives(self, t: float, proposal: Proposal) -> bool:
         """Whether the end beside a singular configuration is to be prepared for."""
         if self._arrival is not Arrival.WATCHED:
-            return self._arrival is Arrival.DUE
+            return False
         if self._zero is None or not self._zero > t:
             return False
         if not abs(self._zero - self._t_end) * self._slope < SINGULAR_END_SIGMA:
@@ -424,11 +429,14 @@ class SingularityPlacement(ControlWrapper):
         else:
             h = proposal.h
             slope = sigma_slope(self._places.inverse, result.sigmas, h)
-            if self._lingering and result.lost_branch:
+            last = proposal.t_new >= self._t_end
+            # Where a method has no nodes, or they were not needed, the end is solved as any stage.
+            unsolved = last and self._arrival is Arrival.DUE and result.away is None
+            unsolved = unsolved and result.sigmas[-1] < BRANCH_SIGMA
+            if self._lingering and (result.lost_branch or unsolved):
                 self._lost_branch, self._redo = True, h
                 self.replaced += 1
                 return StepDecision.REPLACED
-            last = proposal.t_new >= self._t_end
             ends_beside = last and result.sigmas[-1] < SINGULAR_END_SIGMA
             if ends_beside and self._arrival is Arrival.WATCHED and not self._lingering:
                 self._arrival, self._redo = Arrival.DUE, h

@@ -56,6 +56,9 @@ CLOSING_ACCURACY = 1e-12
 CLOSING_ROUNDING = 1e-10
 """Largest motion (rad, scene diagonals) of one that is no smaller than the one before: rounding,
 which grows with the number of loops and like 1/sigma."""
+PROPORTIONAL = (0.4, 0.6)
+"""sigma at half a spacing over that at a whole one, where it vanishes in proportion to the distance;
+where branches touch it is a quarter."""
 LARGEST_MISFIT = 1e-6
 """Largest difference of the multiplier from that of the polynomial without the outermost nodes,
 over the accelerations at the nodes: at the stage, they may balance."""
@@ -117,6 +120,25 @@ class BranchNodes(StageOnBranch):
             if min(sides) >= FIRST_NODE_SIGMA:
                 return spacing * w
         return None
+
+    def distance(self, t: float, state: FloatArray, sigma: float, away: FloatArray) -> float:
+        """Distance (rad, scene diagonals) of the ``state`` (nx,), with ``sigma``, from where sigma
+        vanishes along ``away`` (nv,); NaN where it does so not in proportion to the distance.
+
+        From half the length of ``away`` on, that at which sigma vanishes if it falls at its
+        steepest."""
+        spacing = self._system.position_norm(away)
+        near, far = (
+            [self._sigma_at(t, state, side * part * away) for side in (1.0, -1.0)]
+            for part in (0.5, 1.0)
+        )
+        change = max(abs(there - sigma) for there in far)
+        if sigma > 0.5 * change:
+            return spacing * sigma / change if change > 0.0 else np.inf
+        least, most = PROPORTIONAL
+        if not least <= sum(near) / sum(far) <= most:
+            return np.nan
+        return spacing * abs(far[0] - far[1]) / sum(far)
 
     def _follow(
         self, t: float, state: FloatArray, move: FloatArray, spacing: float

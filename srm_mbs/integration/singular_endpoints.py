@@ -1,7 +1,9 @@
 r"""Runs that start on a singular configuration, and runs that end beside one.
 
 There the direct solve for the multiplier yhat magnifies rounding by 1/sigma^2.  Both kinds of runs
-are given multipliers that are known beforehand, and the stages interpolate them:
+are made by nodes of the branch (:mod:`srm_mbs.integration.methods.branch_nodes`), in a time that is
+proportional to the number of loops.  Other starts, and ends of methods that have no such nodes, are
+given multipliers that are known beforehand, and the stages interpolate them:
 
 * At a start on, or almost on, a singular configuration the multiplier comes from the limit of the
   constraint algebra on the branch that the initial velocity belongs to
@@ -509,9 +511,7 @@ def _uses_nodes(method: Method) -> bool:
     return isinstance(stepper, SplitStep) and stepper.uses_nodes
 
 
-def _start_by_nodes(
-    system: System, t: float, state: FloatArray, memory: IntegratorState
-) -> bool:
+def _start_by_nodes(system: System, t: float, state: FloatArray, memory: IntegratorState) -> bool:
     """Whether the start is solved by nodes of its branch, or directly because it is far enough from
     the singular configuration; without the analysis of branches, in a time proportional to the
     number of loops.

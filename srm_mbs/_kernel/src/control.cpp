@@ -163,7 +163,7 @@ Proposal SingularityPlacement::propose(double t, double limit, IntegratorState& 
 }
 
 // Whether stages next to a singular configuration are to be solved by nodes of the branch: the
-// motion turns back there, or is slow.
+// motion turns back, is slow or ends there.
 bool SingularityPlacement::lingers(const Proposal& proposal, const IntegratorState& memory) const {
     if (!places_->explicit_scheme || lost_branch_ || !memory.history) return false;
     if (memory.history->known_until >= proposal.t_new) return false;
@@ -173,7 +173,7 @@ bool SingularityPlacement::lingers(const Proposal& proposal, const IntegratorSta
     return turning_ || !memory.history->away.empty();
 }
 
-// Whether Python is to prepare for the end next to a singular configuration.
+// Whether it is found that the run, or its interval, ends next to a singular configuration.
 bool SingularityPlacement::arrives(double t, const Proposal& proposal) const {
     if (arrival_ != Arrival::watched) return false;
     if (!(zero_ > t) || !(std::abs(zero_ - t_end_) * slope_ < constants_.singular_end))

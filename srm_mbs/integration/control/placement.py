@@ -10,8 +10,9 @@ r"""Steps placed so that no stage lies on a singular configuration.
   the step is redone, at most three times;
 * where the motion turns back next to a singular configuration, or is slow there, steps are not
   placed: stages may lie anywhere (:mod:`srm_mbs.integration.methods.branch_nodes`);
-* where the run, or its smooth interval, ends beside a singular configuration, steps are not placed:
-  the multipliers up to the end are found first (:mod:`srm_mbs.integration.singular_endpoints`).
+* where the run, or its smooth interval, ends beside a singular configuration, they are not placed
+  either; where there are no nodes of the branch, the multipliers up to the end are found first
+  (:mod:`srm_mbs.integration.singular_endpoints`).
 
 sigma is the modulus of a smooth quantity: at a passage it has a kink.  With the sign changed after
 its zero, the values at the stages of a step follow a polynomial of low degree, from which the zero
@@ -206,7 +207,7 @@ class Arrival(IntEnum):
     WATCHED = 1
     """It may."""
     DUE = 2
-    """It does: a step that reached it was redone."""
+    """It does: stages next to it are solved by nodes of the branch."""
 
 
 def inverse_abscissae(scheme: ButcherTableau) -> list[float]:
@@ -358,7 +359,7 @@ class SingularityPlacement(ControlWrapper):
 
     def _lingers(self, proposal: Proposal, memory: IntegratorState) -> bool:
         """Whether stages next to a singular configuration are to be solved by nodes of the branch:
-        the motion turns back there, or is slow."""
+        the motion turns back, is slow or ends there."""
         history = memory.history
         if not self._places.explicit:
             return False
@@ -374,7 +375,8 @@ class SingularityPlacement(ControlWrapper):
         return self._turning or history.away is not None
 
     def _arrives(self, t: float, proposal: Proposal) -> bool:
-        """Whether the end beside a singular configuration is to be prepared for."""
+        """Whether it is found that the run, or its interval, ends beside a singular
+        configuration."""
         if self._arrival is not Arrival.WATCHED:
             return False
         if self._zero is None or not self._zero > t:
@@ -430,7 +432,7 @@ class SingularityPlacement(ControlWrapper):
             h = proposal.h
             slope = sigma_slope(self._places.inverse, result.sigmas, h)
             last = proposal.t_new >= self._t_end
-            # Where a method has no nodes, or they were not needed, the end is solved as any stage.
+            # Where a method has no nodes, the end is solved as any stage.
             unsolved = last and self._arrival is Arrival.DUE and result.away is None
             unsolved = unsolved and result.sigmas[-1] < BRANCH_SIGMA
             if self._lingering and (result.lost_branch or unsolved):

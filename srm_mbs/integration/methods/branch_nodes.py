@@ -57,8 +57,8 @@ CLOSING_ROUNDING = 1e-10
 """Largest motion (rad, scene diagonals) of one that is no smaller than the one before: rounding,
 which grows with the number of loops and like 1/sigma."""
 PROPORTIONAL = (0.4, 0.6)
-"""sigma at half a spacing over that at a whole one, where it vanishes in proportion to the distance;
-where branches touch it is a quarter."""
+"""sigma at half a spacing over that at a whole one, where it vanishes in proportion to the
+distance; where branches touch it is a quarter."""
 LARGEST_MISFIT = 1e-6
 """Largest difference of the multiplier from that of the polynomial without the outermost nodes,
 over the accelerations at the nodes: at the stage, they may balance."""

@@ -1,7 +1,9 @@
 r"""Runs that start on a singular configuration, and runs that end beside one.
 
 There the direct solve for the multiplier yhat magnifies rounding by 1/sigma^2.  Both kinds of runs
-are given multipliers that are known beforehand, and the stages interpolate them:
+are made by nodes of the branch (:mod:`srm_mbs.integration.methods.branch_nodes`), in a time that is
+proportional to the number of loops.  Other starts, and ends of methods that have no such nodes, are
+given multipliers that are known beforehand, and the stages interpolate them:
 
 * At a start on, or almost on, a singular configuration the multiplier comes from the limit of the
   constraint algebra on the branch that the initial velocity belongs to
@@ -77,6 +79,10 @@ UNDETERMINED_SIGMA = 1e-5
 """sigma below which a start is refused if no singular configuration explains it."""
 TANGENCY_TOLERANCE = 1e-6
 """Largest part of the initial velocity off the branch's tangents, relative to it."""
+ON_BRANCH = 1e-9
+"""Largest distance (rad, scene diagonals) of a start from the polynomial through nodes of its
+branch.  Next to an avoided singular configuration, with the residual delta, it is delta over the
+distance from it, at most the root of delta."""
 BRANCH_LIMIT_TOLERANCE = 1e-7
 """Largest error of the constraint algebra's limit on a branch that could be followed."""
 BRANCHES_LISTED = 4
@@ -505,6 +511,44 @@ def _uses_nodes(method: Method) -> bool:
     return isinstance(stepper, SplitStep) and stepper.uses_nodes
 
 
+def _start_by_nodes(system: System, t: float, state: FloatArray, memory: IntegratorState) -> bool:
+    """Whether the start is solved by nodes of its branch, or directly because it is far enough from
+    the singular configuration; without the analysis of branches, in a time proportional to the
+    number of loops.
+
+    With one degree of freedom the velocity, if it is not zero, leads along the branch.  Where sigma
+    vanishes in proportion to the distance on it, and the state lies on the polynomial through its
+    nodes, there is one branch, and it is singular.
+    """
+    branch_system = system.branch_system
+    if branch_system is None:
+        return False
+    make = getattr(system, "stage_nodes", None)
+    nodes: BranchNodes = BranchNodes(branch_system) if make is None else make
+    v = state[-system.multiplier_size :]
+    try:
+        away = nodes.spaced(t, state, v)
+        if away is None:
+            return False
+        distance = nodes.distance(t, state, memory.sigma, away)
+        if distance >= DIRECT_DISTANCE:
+            return memory.sigma >= UNDETERMINED_SIGMA
+        if not (distance >= 0.0 and nodes.solve(t, state, away)):
+            return False
+    except EvaluationError:
+        return False  # the search for the singular configuration meets it, or does without
+    position, rates = nodes.moved.reshape(2, -1)
+    if system.position_norm(position) > ON_BRANCH:
+        return False
+    if system.position_norm(rates) > TANGENCY_TOLERANCE * system.position_norm(v):
+        return False
+    memory.lingering = True
+    history = replace(MultiplierHistory.begin(t, nodes.multiplier), away=nodes.away)
+    rate = np.concatenate([v, nodes.rate[len(v) :]])
+    memory.set_first_stage(rate, nodes.multiplier, history)
+    return True
+
+
 def start(
     system: System,
     method: Method,
@@ -540,6 +584,9 @@ def start(
         return memory
     q, v = analysis.split(state)
     geometry = analysis.geometry(q, t)
+    one_freedom = not geometry.drives and len(geometry.unit) - analysis.rank == 1
+    if one_freedom and _uses_nodes(method) and _start_by_nodes(system, t, state, memory):
+        return memory
     try:
         limit = _limit_at_start(geometry, analysis.rank, geometry.at(q, t), v, memory.sigma)
     except InputError:

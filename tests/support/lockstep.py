@@ -81,7 +81,7 @@ class Comparison:
     entered
         How many breakpoints were passed.
     arrivals
-        How many ends beside singular configurations were prepared for.
+        How many intervals ended on nodes of the branch, beside singular configurations.
     """
 
     h: float = 0.0
@@ -173,7 +173,6 @@ def compare(
         assert proposal.singular_arrival == (reason is ReturnReason.ARRIVAL)
         if proposal.singular_arrival:
             memory = passing.singular_arrival(t, x, memory)
-            out.arrivals += 1
             continue
         try:
             result = method.step(system, t, proposal.h, x, memory, norm)
@@ -218,6 +217,7 @@ def compare(
             assert result.quiet == compiled_result.quiet
         out.replaced += decision is StepDecision.REPLACED
         if decision is StepDecision.ACCEPTED and result is not None:
+            out.arrivals += proposal.t_new >= passing.end and result.away is not None
             method.accept(memory, result)
             t, x = proposal.t_new, result.state
     return out

@@ -68,8 +68,16 @@ void BranchNodes::find_direction(double t, const double* from, std::vector<doubl
         }
         add(slopes[j], f, w.data(), nv_);
     }
+    if (!(largest(w.data(), nv_) > 0.0)) return;
+    if (!spaced(t, from, w, out))
+        TouchingBranch::frame_at(system_, constants_, t, from, basis_.data(), slopes, out);
+}
+
+bool BranchNodes::spaced(double t, const double* from, std::vector<double>& w,
+                         std::vector<double>& out) {
+    out.clear();
     const double size = system_.position_norm(w.data());
-    if (!(size > 0.0)) return;
+    if (!(size > 0.0)) return false;
     for (double& x : w) x /= size;
     for (int doublings = 0; doublings <= constants_.node_doublings; ++doublings) {
         const double spacing = std::ldexp(constants_.node_spacing, doublings);
@@ -78,9 +86,9 @@ void BranchNodes::find_direction(double t, const double* from, std::vector<doubl
             continue;
         out = w;
         for (double& x : out) x *= spacing;
-        return;
+        return true;
     }
-    TouchingBranch::frame_at(system_, constants_, t, from, basis_.data(), slopes, out);
+    return false;
 }
 
 // Node k: the point of the branch that is nearest, in the mass metric, to the state moved along
@@ -114,9 +122,10 @@ bool BranchNodes::follow(int k, double t, const double* from,
         if (iteration == 0 &&
             change > constants_.node_closing * system_.position_norm(direction.data()))
             return false;
-        if (!(change < last) && iteration > 1) return false;
+        const bool settled = iteration > 1 && !(change < last);
+        if (settled && !(change < constants_.node_rounding)) return false;
         last = change;
-        if (change < constants_.node_accuracy) {
+        if (settled || change < constants_.node_accuracy) {
             system_.correction(change_.data());
             std::copy(change_.begin() + nv_, change_.end(), &off_[k * nv_]);
             for (int i = 0; i < nv_; ++i) node[nx_ - nv_ + i] = v[i] - off_[k * nv_ + i];

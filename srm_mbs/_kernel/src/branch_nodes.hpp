@@ -19,6 +19,9 @@ public:
     // nodes are apart, or its frame where branches touch; empty if the state (nx,) does not
     // determine it.
     void find_direction(double t, const double* state, std::vector<double>& away);
+    // The direction w (nv,), which is scaled, as long as nodes are apart; false, and empty, if no
+    // spacing suffices.
+    bool spaced(double t, const double* state, std::vector<double>& w, std::vector<double>& away);
     // Moves the state (nx,) onto its branch, and solves for its multiplier; whether it could.
     bool solve(double t, const double* state, const std::vector<double>& away);
 

@@ -32,6 +32,7 @@ namespace srm {
     field(int, node_iterations)            /* onto the closures */                                 \
     field(double, node_closing)            /* largest first one, over the spacing */               \
     field(double, node_accuracy)           /* last one (units) */                                  \
+    field(double, node_rounding)           /* the same, where it does not shrink */               \
     field(double, node_misfit)             /* largest relative error of the multiplier */          \
     /* Touching branches: methods/touching_branches.py. */                                         \
     field(double, touching)                /* distance of the first nodes (units), at least */     \

@@ -145,9 +145,10 @@ Proposal SingularityPlacement::propose(double t, double limit, IntegratorState& 
     if (adaptive && slope_ > 0.0) limit = std::min(limit, constants_.max_sigma_change / slope_);
     memory.sigma_slope = slope_;
     const Proposal proposal = inner_->propose(t, limit, memory);
+    if (arrives(t, proposal)) arrival_ = Arrival::due;
     lingering_ = memory.lingering = lingers(proposal, memory);
     if (lingering_) return proposal;
-    if (arrives(t, proposal)) {
+    if (arrival_ == Arrival::due) {
         arrival_ = Arrival::none;
         return {proposal.h, proposal.t_new, proposal.placed, true};
     }
@@ -165,18 +166,19 @@ Proposal SingularityPlacement::propose(double t, double limit, IntegratorState& 
 }
 
 // Whether stages next to a singular configuration are to be solved by nodes of the branch: the
-// motion turns back there, or is slow.
+// motion turns back, is slow or ends there.
 bool SingularityPlacement::lingers(const Proposal& proposal, const IntegratorState& memory) const {
     if (!places_->explicit_scheme || lost_branch_ || !memory.history) return false;
     if (memory.history->known_until >= proposal.t_new) return false;
     if (!adaptive) return !memory.history->away.empty();
+    if (arrival_ == Arrival::due) return true;
     if (!(memory.sigma < constants_.monitored_below)) return false;
     return turning_ || !memory.history->away.empty();
 }
 
-// Whether Python is to prepare for the end next to a singular configuration.
+// Whether it is found that the run, or its interval, ends next to a singular configuration.
 bool SingularityPlacement::arrives(double t, const Proposal& proposal) const {
-    if (arrival_ != Arrival::watched) return arrival_ == Arrival::due;
+    if (arrival_ != Arrival::watched) return false;
     if (!(zero_ > t) || !(std::abs(zero_ - t_end_) * slope_ < constants_.singular_end))
         return false;
     // Of many loops sigma is no parabola, and its zero not known that well: only the step to the
@@ -226,13 +228,16 @@ StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepRe
                          c > 0.0 ? std::abs(sigmas[middle] - start) / c : 0.0) / h;
     } else if (result) {
         slope = sigma_slope(abscissae, result->sigmas, h, places_->slope_from);
-        if (lingering_ && result->lost_branch) {
+        const bool last = proposal.t_new >= t_end_;
+        // Where a method has no nodes, the end is solved as any stage.
+        const bool unsolved = last && arrival_ == Arrival::due && result->away.empty() &&
+                              result->sigmas.back() < constants_.branch_below;
+        if (lingering_ && (result->lost_branch || unsolved)) {
             lost_branch_ = true;
             redo_ = h;
             ++replaced;
             return StepDecision::replaced;
         }
-        const bool last = proposal.t_new >= t_end_;
         if (last && !lingering_ && arrival_ == Arrival::watched &&
             result->sigmas.back() < constants_.singular_end) {
             arrival_ = Arrival::due;

@@ -218,8 +218,8 @@ private:
     bool arrives(double t, const Proposal& proposal) const;
     bool lingers(const Proposal& proposal, const IntegratorState& memory) const;
 
-    // Whether the end next to a singular configuration is prepared for: never or done, if one is
-    // found, or now.
+    // Whether the end next to a singular configuration matters: not, or not any more; if one is
+    // found; it was, and stages are solved by nodes of the branch.
     enum class Arrival { none = 0, watched = 1, due = 2 };
 
     const Constants& constants_;

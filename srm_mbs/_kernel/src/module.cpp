@@ -18,6 +18,7 @@
 
 #include "algebra.hpp"
 #include "branch_motion.hpp"
+#include "branch_nodes.hpp"
 #include "constants.hpp"
 #include "dense.hpp"
 #include "errors.hpp"
@@ -690,6 +691,30 @@ void bind_system(nb::module_& m) {
 
 // ---- Branch motion ------------------------------------------------------------------------------
 
+struct PyBranchNodes {
+    nb::object owner;  // kept alive
+    System& system;
+    BranchNodes nodes;
+
+    PyBranchNodes(nb::object owner_, const Constants& constants)
+        : owner(std::move(owner_)),
+          system(*nb::cast<PySystem&>(owner).system),
+          nodes(system, constants) {}
+
+    // (state, rate, multiplier, moved, away) of a stage (nx,) along the direction `away` (nv,), or
+    // None.
+    nb::object solve(double t, const Array& state, const Array& away) {
+        expect_size("state", state.size(), static_cast<std::size_t>(system.nq + system.nv));
+        expect_size("away", away.size(), static_cast<std::size_t>(system.nv));
+        const std::vector<double> direction = to_vector(away);
+        system.evaluate(t, state.data(), System::ZoneView{});
+        if (!nodes.solve(t, state.data(), direction)) return nb::none();
+        return nb::make_tuple(owned_array(nodes.state), owned_array(nodes.rate),
+                              owned_array(nodes.multiplier), owned_array(nodes.moved),
+                              owned_array(nodes.away));
+    }
+};
+
 struct PyBranchMotion {
     nb::object owner;  // kept alive
     System& system;
@@ -754,6 +779,10 @@ void bind_branch_motion(nb::module_& m) {
         .def_prop_ro("rate", [](const BranchPoint& p) { return owned_array(p.rate); })
         .def_prop_ro("multiplier", [](const BranchPoint& p) { return owned_array(p.multiplier); })
         .def_ro("sigma", &BranchPoint::sigma);
+    nb::class_<PyBranchNodes>(
+        m, "BranchNodes", nb::type_slots(collected<PyBranchNodes, &PyBranchNodes::owner>()))
+        .def(nb::init<nb::object, const Constants&>(), nb::keep_alive<1, 3>())
+        .def("solve", &PyBranchNodes::solve, nb::arg("t"), nb::arg("state"), nb::arg("away"));
     nb::class_<PyBranchMotion>(
         m, "BranchMotion", nb::type_slots(collected<PyBranchMotion, &PyBranchMotion::owner>()))
         .def(nb::init<nb::object, const ButcherTableau&, const Constants&, const ErrorNorm&>(),

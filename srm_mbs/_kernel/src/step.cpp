@@ -334,10 +334,10 @@ bool SplitStep::solve_on_branch(double t, double start, const double* state,
                                 const IntegratorState& memory) {
     if (result.lost_branch) return false;
     if (!nodes_) nodes_.emplace(system_, constants);
-    bool found = true;
+    bool found = true, known = true;
     if (away_.empty()) {
         away_ = memory.history->away;
-        const bool known = !away_.empty();
+        known = !away_.empty();
         if (!known) nodes_->find_direction(start, state, away_);
         touches_ = away_.size() > static_cast<std::size_t>(nv_);
         if (touches_) {
@@ -352,6 +352,15 @@ bool SplitStep::solve_on_branch(double t, double start, const double* state,
         found = touching_->solve(t, x_.data(), *nodes_);
     else
         found = nodes_->solve(t, x_.data(), away_);
+    if (!found && !known) {
+        // From a start far away, or past a bend, the motion itself leads along its branch.
+        std::vector<double> w(x_.end() - nv_, x_.end());
+        touches_ = false;
+        if (nodes_->spaced(t, x_.data(), w, away_)) {
+            system_.evaluate(t, x_.data(), System::ZoneView{});
+            found = nodes_->solve(t, x_.data(), away_);
+        }
+    }
     result.lost_branch = !found;
     return found;
 }

@@ -10,8 +10,9 @@ r"""Steps placed so that no stage lies on a singular configuration.
   the step is redone, at most three times;
 * where the motion turns back next to a singular configuration, or is slow there, steps are not
   placed: stages may lie anywhere (:mod:`srm_mbs.integration.methods.branch_nodes`);
-* where the run, or its smooth interval, ends beside a singular configuration, steps are not placed:
-  the multipliers up to the end are found first (:mod:`srm_mbs.integration.singular_endpoints`).
+* where the run, or its smooth interval, ends beside a singular configuration, they are not placed
+  either; where there are no nodes of the branch, the multipliers up to the end are found first
+  (:mod:`srm_mbs.integration.singular_endpoints`).
 
 sigma is the modulus of a smooth quantity: at a passage it has a kink.  With the sign changed after
 its zero, the values at the stages of a step follow a polynomial of low degree, from which the zero
@@ -35,6 +36,7 @@ from srm_mbs.integration.control.step_size import (
     StepSizeControl,
 )
 from srm_mbs.integration.methods.base import IntegratorState, StepResult
+from srm_mbs.integration.methods.branch_nodes import BRANCH_SIGMA
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.near_singular import WATCHED_SIGMA
 
@@ -209,7 +211,7 @@ class Arrival(IntEnum):
     WATCHED = 1
     """It may."""
     DUE = 2
-    """It does: a step that reached it was redone."""
+    """It does: stages next to it are solved by nodes of the branch."""
 
 
 def inverse_abscissae(scheme: ButcherTableau, scatters: bool = False) -> list[float]:
@@ -333,10 +335,12 @@ class SingularityPlacement(ControlWrapper):
             if longest < limit:
                 limit = longest
         proposal = self._inner.propose(t, limit, memory)
+        if self._arrives(t, proposal):
+            self._arrival = Arrival.DUE
         self._lingering = memory.lingering = self._lingers(proposal, memory)
         if self._lingering:
             return proposal
-        if self._arrives(t, proposal):
+        if self._arrival is Arrival.DUE:
             self._arrival = Arrival.NONE
             return replace(proposal, singular_arrival=True)
         # Where the multipliers are known, stages may lie anywhere.
@@ -367,7 +371,7 @@ class SingularityPlacement(ControlWrapper):
 
     def _lingers(self, proposal: Proposal, memory: IntegratorState) -> bool:
         """Whether stages next to a singular configuration are to be solved by nodes of the branch:
-        the motion turns back there, or is slow."""
+        the motion turns back, is slow or ends there."""
         history = memory.history
         if not self._places.explicit:
             return False
@@ -375,15 +379,18 @@ class SingularityPlacement(ControlWrapper):
             return False
         if not self.adaptive:
             return history.away is not None
+        if self._arrival is Arrival.DUE:
+            return True
         if not memory.sigma < WATCHED_SIGMA:
             return False
         # Where nodes solved the last state, sigma at stages off the branch need not be a parabola.
         return self._turning or history.away is not None
 
     def _arrives(self, t: float, proposal: Proposal) -> bool:
-        """Whether the end beside a singular configuration is to be prepared for."""
+        """Whether it is found that the run, or its interval, ends beside a singular
+        configuration."""
         if self._arrival is not Arrival.WATCHED:
-            return self._arrival is Arrival.DUE
+            return False
         if self._zero is None or not self._zero > t:
             return False
         if not abs(self._zero - self._t_end) * self._slope < SINGULAR_END_SIGMA:
@@ -436,11 +443,14 @@ class SingularityPlacement(ControlWrapper):
         else:
             h = proposal.h
             slope = sigma_slope(self._places.inverse, result.sigmas, h)
-            if self._lingering and result.lost_branch:
+            last = proposal.t_new >= self._t_end
+            # Where a method has no nodes, the end is solved as any stage.
+            unsolved = last and self._arrival is Arrival.DUE and result.away is None
+            unsolved = unsolved and result.sigmas[-1] < BRANCH_SIGMA
+            if self._lingering and (result.lost_branch or unsolved):
                 self._lost_branch, self._redo = True, h
                 self.replaced += 1
                 return StepDecision.REPLACED
-            last = proposal.t_new >= self._t_end
             ends_beside = last and result.sigmas[-1] < SINGULAR_END_SIGMA
             if ends_beside and self._arrival is Arrival.WATCHED and not self._lingering:
                 self._arrival, self._redo = Arrival.DUE, h

@@ -1,4 +1,4 @@
-"""Nodes of the motion next to a singular configuration, made by the compiled kernel."""
+"""The motion next to a singular configuration, and nodes of its branch, by the compiled kernel."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from srm_mbs.dynamics.singularities.branch_limit import BranchCurve
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.kernel.marshalling import CONSTANTS, norm_struct, tableau_struct
 from srm_mbs.integration.methods.base import ErrorNorm
+from srm_mbs.integration.methods.branch_nodes import BranchNodes
 from srm_mbs.integration.methods.tableaus import get_tableau
 from srm_mbs.integration.singular_endpoints import Point
 
@@ -32,6 +33,26 @@ def curve_struct(curve: BranchCurve) -> Any:
         first=first,
         last=last,
     )
+
+
+class CompiledBranchNodes(BranchNodes):
+    """:class:`~srm_mbs.integration.methods.branch_nodes.BranchNodes` by the kernel, for stages of
+    ``evaluator``, an :class:`~srm_mbs.integration.kernel.system.Evaluator`."""
+
+    def __init__(self, evaluator: Any) -> None:
+        super().__init__(evaluator)
+        self._nodes = core.BranchNodes(evaluator.kernel_system, CONSTANTS)  # type: ignore[union-attr]
+
+    def solve(self, t: float, state: FloatArray, away: FloatArray) -> bool:
+        """Solve the stage ``state`` (nx,) at t (s); whether it could be solved."""
+        try:
+            found = self._nodes.solve(t, state, away)
+        except ArithmeticError as error:
+            raise EvaluationError("a node of the branch") from error
+        if found is not None:
+            self.state, self.rate, self.multiplier, self.moved, along = found
+            self.away = along[None]
+        return found is not None
 
 
 class CompiledNodes:

@@ -83,6 +83,7 @@ def constants() -> Any:
         node_iterations=branch_nodes.MAX_CLOSINGS,
         node_closing=branch_nodes.LARGEST_CLOSING,
         node_accuracy=branch_nodes.CLOSING_ACCURACY,
+        node_rounding=branch_nodes.CLOSING_ROUNDING,
         node_misfit=branch_nodes.LARGEST_MISFIT,
         touching=touching_branches.TOUCHING,
         touching_farthest=touching_branches.FARTHEST,

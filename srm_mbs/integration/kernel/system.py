@@ -13,7 +13,7 @@ from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.system import Zone
-from srm_mbs.integration.kernel.branch_motion import CompiledNodes
+from srm_mbs.integration.kernel.branch_motion import CompiledBranchNodes, CompiledNodes
 from srm_mbs.integration.kernel.marshalling import system_struct
 from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.model.mechanism import MechanismData, per_model
@@ -216,6 +216,11 @@ class Evaluator:
     def branch_nodes(self, norm: ErrorNorm) -> CompiledNodes:
         """Makes the nodes of the motion next to a singular configuration."""
         return CompiledNodes(self.kernel_system, norm)
+
+    @property
+    def stage_nodes(self) -> CompiledBranchNodes:
+        """Solves stages by nodes of their branch."""
+        return CompiledBranchNodes(self)
 
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Any:
         """Terms of a stage; see :class:`~srm_mbs.dynamics.system.System`."""

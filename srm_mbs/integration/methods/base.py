@@ -111,8 +111,8 @@ class IntegratorState:
     steps
         Number of accepted steps.
     lingering
-        Whether the motion turns back next to a singular configuration, or is slow there, so that
-        its stages are solved by nodes of the branch.
+        Whether the motion turns back next to a singular configuration, is slow there, or starts or
+        ends there, so that its stages are solved by nodes of the branch.
     stiff
         Whether the problem was found to be stiff.
     stiff_steps, other_steps

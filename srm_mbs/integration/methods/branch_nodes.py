@@ -53,6 +53,12 @@ LARGEST_CLOSING = 0.5
 """Largest motion of the first of them, over the spacing: beyond it lies another branch."""
 CLOSING_ACCURACY = 1e-12
 """Motion (rad, scene diagonals) of the last of them; the next one would be a hundredth of it."""
+CLOSING_ROUNDING = 1e-10
+"""Largest motion (rad, scene diagonals) of one that is no smaller than the one before: rounding,
+which grows with the number of loops and like 1/sigma."""
+PROPORTIONAL = (0.4, 0.6)
+"""sigma at half a spacing over that at a whole one, where it vanishes in proportion to the
+distance; where branches touch it is a quarter."""
 LARGEST_MISFIT = 1e-6
 """Largest difference of the multiplier from that of the polynomial without the outermost nodes,
 over the accelerations at the nodes: at the stage, they may balance."""
@@ -115,6 +121,25 @@ class BranchNodes(StageOnBranch):
                 return spacing * w
         return None
 
+    def distance(self, t: float, state: FloatArray, sigma: float, away: FloatArray) -> float:
+        """Distance (rad, scene diagonals) of the ``state`` (nx,), with ``sigma``, from where sigma
+        vanishes along ``away`` (nv,); NaN where it does so not in proportion to the distance.
+
+        From half the length of ``away`` on, that at which sigma vanishes if it falls at its
+        steepest."""
+        spacing = self._system.position_norm(away)
+        near, far = (
+            [self._sigma_at(t, state, side * part * away) for side in (1.0, -1.0)]
+            for part in (0.5, 1.0)
+        )
+        change = max(abs(there - sigma) for there in far)
+        if sigma > 0.5 * change:
+            return spacing * sigma / change if change > 0.0 else np.inf
+        least, most = PROPORTIONAL
+        if not least <= sum(near) / sum(far) <= most:
+            return np.nan
+        return spacing * abs(far[0] - far[1]) / sum(far)
+
     def _follow(
         self, t: float, state: FloatArray, move: FloatArray, spacing: float
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
@@ -136,10 +161,11 @@ class BranchNodes(StageOnBranch):
             closing = further
             if iteration == 0 and change > LARGEST_CLOSING * spacing:
                 return None
-            if iteration > 1 and not change < last:
+            settled = iteration > 1 and not change < last
+            if settled and not change < CLOSING_ROUNDING:
                 return None
             last = change
-            if change < CLOSING_ACCURACY:
+            if settled or change < CLOSING_ACCURACY:
                 off = terms.correction()[system.nv :]
                 node[-system.nv :] = v - off
                 return node, closing, off
@@ -211,16 +237,25 @@ class StageNodes(BranchNodes):
         """Solve the stage ``state`` (nx,); whether it could be solved."""
         if self.lost:
             return False
-        if self._direction is None:
+        known = self._direction is not None
+        if not known:
             self._direction = self.find_direction(*self._start)
-        if self._direction is None:
-            solved = False
-        elif len(self._direction) > 1:
-            solved = self._solve_touching(t, state, self._direction)
-        else:
-            solved = self.solve(t, state, self._direction[0])
+        solved = self._solve_along(t, state)
+        if not solved and not known:
+            # From a start far away, or past a bend, the motion itself leads along its branch.
+            away = self.spaced(t, state, state[-self._system.nv :])
+            if away is not None:
+                self._direction = away[None]
+                solved = self.solve(t, state, away)
         self.used, self.lost = self.used or solved, not solved
         return solved
+
+    def _solve_along(self, t: float, state: FloatArray) -> bool:
+        if self._direction is None:
+            return False
+        if len(self._direction) > 1:
+            return self._solve_touching(t, state, self._direction)
+        return self.solve(t, state, self._direction[0])
 
     def _solve_touching(self, t: float, state: FloatArray, direction: FloatArray) -> bool:
         if self._touching is None:

@@ -23,6 +23,7 @@ from srm_mbs.assembly.position import (
     assemble_within_limits,
     beyond_limits,
 )
+from srm_mbs.assembly.regular_start import regular_start
 from srm_mbs.assembly.velocity import assemble_velocity
 from srm_mbs.dynamics.constraints.geometry import DriveRows
 from srm_mbs.dynamics.constraints.row_algebra import null_basis
@@ -31,6 +32,7 @@ from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import AssemblyError, EvaluationError, InputError, get_logger, naming
 from srm_mbs.model.coordinates import free_coordinates, set_position, set_rate
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import finite_numbers, flag, name_list, named_values
 
 log = get_logger(__name__)
@@ -147,16 +149,31 @@ class ConsistentStart:
     ----------
     mechanism
         The mechanism in this state.
-    problem
-        Its closure equations; None without closures and drives.
-    at_rest
-        The mechanism in this configuration with the rates that it had before, which is analysed
-        where it is singular; ``mechanism`` itself if these are the consistent ones.
+    guess
+        The mechanism as it was given.
+    start : (nq,)
+        The guess of its configuration, at which units are measured.
+    searched
+        Its closure equations, if it was searched with these.
     """
 
     mechanism: Mechanism
-    problem: ClosureProblem | None
-    at_rest: Mechanism
+    guess: Mechanism
+    start: FloatArray
+    searched: ClosureProblem | None = None
+
+    @cached_property
+    def problem(self) -> ClosureProblem:
+        """Its closure equations."""
+        return self.searched or ClosureProblem(self.guess, self.start)
+
+    @cached_property
+    def at_rest(self) -> Mechanism:
+        """The mechanism in this configuration with the rates that it had before, which is analysed
+        where it is singular; ``mechanism`` itself if these are the consistent ones."""
+        found, rates = self.mechanism, self.guess.v0
+        same = np.array_equal(found.v0, rates)
+        return found if same else found.with_state(found.q0, rates)
 
 
 def consistent_start(
@@ -211,25 +228,28 @@ def consistent_start(
     elif v is not None:
         rates = np.array(finite_numbers(v, model.nv, "v", ARRAY_OR_MAPPING))
     if not mechanism.constrained:
-        open_start = mechanism.with_state(start, rates)
-        return ConsistentStart(open_start, None, open_start)
-    held, to_close = _with_absolute_drives(mechanism, start, held)
-    problem = ClosureProblem(to_close, start)
-    closed = start.copy()
-    if to_close.loops:
-        _check_distances(problem, start)
-        closed = _positions(to_close, problem, start, held, limits)
-    if to_close is not mechanism:
-        problem = ClosureProblem(mechanism, start)
-    for name in held:  # moving a quaternion by nothing rounds it
-        joint = mechanism.joint(name)
-        own = slice(joint.idx_q, joint.idx_q + joint.nq)
-        closed[own] = start[own]
-    # Walks from open loops find few closed configurations: analyses begin here.
-    at_rest = mechanism.with_state(closed, mechanism.v0)
-    consistent = assemble_velocity(mechanism, problem, closed, rates, held_rates, at_rest)
-    same = np.array_equal(consistent, at_rest.v0)
-    found = at_rest if same else mechanism.with_state(closed, consistent)
+        return ConsistentStart(mechanism.with_state(start, rates), mechanism, start)
+    problem = None
+    state = regular_start(mechanism, start, rates, held, held_rates)
+    if state is not None and not (limits and beyond_limits(mechanism, state[0])):
+        closed, consistent = state
+        _restore_held(mechanism, closed, start, held)
+        found = mechanism.with_state(closed, consistent)
+    else:
+        held, to_close = _with_absolute_drives(mechanism, start, held)
+        problem = ClosureProblem(to_close, start)
+        closed = start.copy()
+        if to_close.loops:
+            _check_distances(problem, start)
+            closed = _positions(to_close, problem, start, held, limits)
+        if to_close is not mechanism:
+            problem = ClosureProblem(mechanism, start)
+        _restore_held(mechanism, closed, start, held)
+        # Walks from open loops find few closed configurations: analyses begin here.
+        at_rest = mechanism.with_state(closed, mechanism.v0)
+        consistent = assemble_velocity(mechanism, problem, closed, rates, held_rates, at_rest)
+        same = np.array_equal(consistent, at_rest.v0)
+        found = at_rest if same else mechanism.with_state(closed, consistent)
     if log.isEnabledFor(logging.DEBUG):
         residuals, _ = found.initial_errors
         log.debug(
@@ -238,7 +258,18 @@ def consistent_start(
             ", ".join(held) or "no joint",
             np.abs(residuals).max(initial=0.0),
         )
-    return ConsistentStart(found, problem, at_rest)
+    return ConsistentStart(found, mechanism, start, problem)
+
+
+def _restore_held(
+    mechanism: Mechanism, q: FloatArray, start: FloatArray, held: tuple[str, ...]
+) -> None:
+    """Give the joints that are ``held`` exactly their positions in ``start``, because moving a
+    quaternion by nothing rounds it."""
+    for name in held:
+        joint = mechanism.joint(name)
+        own = slice(joint.idx_q, joint.idx_q + joint.nq)
+        q[own] = start[own]
 
 
 def assemble(
@@ -291,10 +322,11 @@ def assemble(
         coincide.
     """
     start = consistent_start(mechanism, q, v, guess=guess, hold=hold, limits=limits)
-    found, problem = start.mechanism, start.problem
-    if problem is None:
+    found = start.mechanism
+    if not mechanism.constrained:
         nothing, everything = np.zeros(0), np.eye(mechanism.model.nv)
         return Assembly(found.q0.copy(), found.v0.copy(), nothing, nothing, everything, False)
+    problem = start.problem
     drives = DriveRows(mechanism, problem, found.q0)
     free = null_basis(np.concatenate([problem.normalised(found.q0), drives.rows]), SINGULAR)
     if structure_of.kept(mechanism) is None:

@@ -23,7 +23,8 @@ from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.lazy import cached_property
-from srm_mbs.model.mechanism import MechanismData, per_model
+from srm_mbs.model.mechanism import MechanismData, per_model, per_tree
+from srm_mbs.model.model_data import TreeNumbers, tree_numbers
 
 RELATIVE_ROUNDING = 1e-12
 """Accelerations below this part of the largest are rounding of zero; so is a scene diagonal below
@@ -96,6 +97,12 @@ def angle_coordinates(model: pin.Model) -> BoolArray:
     data = workspace(model)
     pin.computeJointJacobians(model, data, pin.neutral(model))
     return _angle_components(data)
+
+
+@per_tree
+def rotating_coordinates(mechanism: MechanismData) -> list[int]:
+    """The velocity components that are in rad/s."""
+    return np.flatnonzero(angle_coordinates(mechanism.model)).tolist()
 
 
 def periodic_coordinates(model: pin.Model) -> BoolArray:
@@ -185,10 +192,32 @@ def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> 
         return _units_at(mechanism, q, v)
     known, key = _known_units(mechanism), (gravity.tobytes(), q.tobytes())
     if key not in known:
-        if len(known) >= KEPT_UNITS:
-            known.clear()
-        known[key] = _units_at(mechanism, q, v)
+        _keep_units(mechanism, key, _units_at(mechanism, q, v))
     return known[key]
+
+
+def keep_units(mechanism: MechanismData, q: FloatArray, diagonal: float) -> None:
+    """Take the units at q (nq,) from now on from the ``diagonal`` (m) of the scene there, which the
+    kernel computed; they are asked for again where they depend on rates."""
+    gravity = mechanism.model.gravity.linear
+    if not gravity.any():
+        return
+    length = diagonal or 1.0
+    coordinate = np.full(mechanism.model.nv, length)
+    coordinate[rotating_coordinates(mechanism)] = 1.0
+    units = Units(length, coordinate, _rate_by_gravity(mechanism.model, length))
+    _keep_units(mechanism, (gravity.tobytes(), q.tobytes()), units)
+
+
+def _keep_units(mechanism: MechanismData, key: tuple[bytes, bytes], units: Units) -> None:
+    known = _known_units(mechanism)
+    if len(known) >= KEPT_UNITS:
+        known.clear()
+    known[key] = units
+
+
+def _rate_by_gravity(model: pin.Model, length: float) -> float:
+    return float(np.sqrt(np.linalg.norm(model.gravity.linear) / length))
 
 
 def _units_at(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> Units:
@@ -197,7 +226,7 @@ def _units_at(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> Units:
     pin.computeJointJacobians(model, data, q)
     length = _diagonal(mechanism, data) or 1.0
     coordinate = np.where(_angle_components(data), 1.0, length)
-    rate = float(np.sqrt(np.linalg.norm(model.gravity.linear) / length))
+    rate = _rate_by_gravity(model, length)
     if rate == 0.0:
         rates = np.abs(v) / coordinate
         if not rates.any() and mechanism.forces:
@@ -239,18 +268,23 @@ class BodyNumbers(NamedTuple):
     (kg m^2) of a body."""
 
     mass: float
-    lever: FloatArray
+    lever: list[float]
     trace: float
 
 
 @per_model
+def numbers_of_tree(mechanism: MechanismData) -> TreeNumbers:
+    """The numbers of its model, which the analyses of a load share."""
+    return tree_numbers(mechanism.model)
+
+
+@per_model
 def body_numbers(mechanism: MechanismData) -> list[BodyNumbers]:
-    """Those of the bodies of all joints, the ground's first; the analyses of a load share them,
-    because Pinocchio takes a microsecond for each."""
+    """Those of the bodies of all joints, the ground's first."""
     return [
         # Lumping and shifting may round the trace of a point mass to a negative number.
-        BodyNumbers(float(body.mass), body.lever.copy(), max(float(body.inertia.trace()), 0.0))
-        for body in mechanism.model.inertias.tolist()
+        BodyNumbers(mass, lever, max(xx + yy + zz, 0.0))
+        for mass, *lever, xx, _, _, yy, _, zz in numbers_of_tree(mechanism).bodies.tolist()
     ]
 
 
@@ -259,19 +293,20 @@ def _marked_points(mechanism: MechanismData) -> tuple[IndexArray, FloatArray]:
     """Joints (k,) and points (k, 3) in their axes: the joints themselves, centres of mass, and
     anchors of closures."""
     bodies = enumerate(islice(body_numbers(mechanism), 1, None), 1)
-    found = [(joint, np.zeros(3)) for joint in range(1, mechanism.model.njoints)]
+    origin = [0.0, 0.0, 0.0]
+    found = [(joint, origin) for joint in range(1, mechanism.model.njoints)]
     found += [(joint, body.lever) for joint, body in bodies if body.mass > 0.0]
     found += anchor_points(mechanism)
-    found = found or [(0, np.zeros(3))]
+    found = found or [(0, origin)]
     return np.array([joint for joint, _ in found]), np.array([point for _, point in found])
 
 
 @per_model
-def anchor_points(mechanism: MechanismData) -> list[tuple[int, FloatArray]]:
+def anchor_points(mechanism: MechanismData) -> list[tuple[int, list[float]]]:
     """Joint, and origin (3,) in its axes, of every anchor of a closure."""
     closures = [*mechanism.loops, *driven_closures(mechanism.drives)]
     places = [anchor.resolve(mechanism.model) for loop in closures for anchor in loop.anchors]
-    return [(joint, placement.translation.copy()) for joint, placement in places]
+    return [(joint, placement.translation.tolist()) for joint, placement in places]
 
 
 def _acceleration_by_forces(mechanism: MechanismData, q: FloatArray) -> FloatArray:

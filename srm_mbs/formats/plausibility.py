@@ -15,6 +15,7 @@ from srm_mbs.dynamics.scaling import (
     body_numbers,
     coordinate_units,
     is_angle,
+    numbers_of_tree,
     scene_diagonal,
 )
 from srm_mbs.model.numbers import vector_elements
@@ -52,11 +53,12 @@ def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:
     if scene == 1.0:
         scene = scene_diagonal(mechanism, mechanism.q0)
     sizes = [0.0] * model.njoints
-    parents, places = vector_elements(model.parents), model.jointPlacements.tolist()
-    ends = [(parents[joint], places[joint].translation) for joint in range(1, model.njoints)]
+    parents = vector_elements(model.parents)
+    places = numbers_of_tree(mechanism).placements[:, 9:].tolist()
+    ends = [(parents[joint], places[joint]) for joint in range(1, model.njoints)]
     ends += anchor_points(mechanism)
     for joint, place in ends:
-        sizes[joint] = max(sizes[joint], math.hypot(*place.tolist()))
+        sizes[joint] = max(sizes[joint], math.hypot(*place))
     for joint, body in islice(enumerate(body_numbers(mechanism)), 1, None):
         half_trace = 0.5 * body.trace
         if body.mass == 0.0:
@@ -68,7 +70,7 @@ def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:
             continue
         # The largest principal moment of a real body is a third to a half of the trace.
         gyration = math.sqrt(half_trace / body.mass)
-        size = max(sizes[joint], math.hypot(*body.lever.tolist()))
+        size = max(sizes[joint], math.hypot(*body.lever))
         if gyration > LARGEST_GYRATION * scene > 0.0:
             yield (
                 f"{_body(model, joint)} has a radius of gyration of {gyration:.3g} m in a "

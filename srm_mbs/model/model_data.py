@@ -8,7 +8,7 @@ follow when the joints are added.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -22,6 +22,7 @@ from pydantic import (
     model_validator,
 )
 
+from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
 
@@ -164,6 +165,32 @@ def _placement(numbers: list[float]) -> pin.SE3:
 def _inertia_numbers(inertia: pin.Inertia) -> list[float]:
     upper = inertia.inertia[np.triu_indices(3)]
     return [float(inertia.mass), *inertia.lever.tolist(), *upper.tolist()]
+
+
+class TreeNumbers(NamedTuple):
+    """Numbers of every joint of a model, the universe's first.
+
+    Attributes
+    ----------
+    placements : (njoints, 12)
+        Placement in its parent: rotation row by row, then translation (m).
+    bodies : (njoints, 10)
+        Its body: mass (kg), centre of mass (m), and xx, xy, xz, yy, yz, zz (kg m^2) about it.
+    """
+
+    placements: FloatArray
+    bodies: FloatArray
+
+
+def tree_numbers(model: pin.Model) -> TreeNumbers:
+    """The numbers of ``model``, by the kernel where there is one: Pinocchio's Python objects take a
+    microsecond for each placement and body."""
+    if core is not None:
+        return TreeNumbers(*core.tree_numbers(model))
+    return TreeNumbers(
+        np.array([_placement_numbers(at) for at in model.jointPlacements.tolist()]),
+        np.array([_inertia_numbers(body) for body in model.inertias.tolist()]),
+    )
 
 
 def _inertia(numbers: list[float]) -> pin.Inertia:

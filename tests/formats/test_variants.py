@@ -279,9 +279,10 @@ def test_rows_of_a_variant_are_those_of_its_own_closures(bars: Path) -> None:
         (found,), (expected,) = rows.constants()["loops"], own.constants()["loops"]
         for key, value in expected.items():
             assert np.array_equal(found[key], value), key
-    points = [(joint, at.tolist()) for joint, at in anchor_points(variant)]
     places = [anchor.resolve(variant.model) for anchor in loops[0].anchors]
-    assert points == [(joint, place.translation.tolist()) for joint, place in places]
+    assert anchor_points(variant) == [
+        (joint, place.translation.tolist()) for joint, place in places
+    ]
 
 
 def test_a_variant_with_a_fault_is_refused_as_a_load_is(tmp_path: Path) -> None:

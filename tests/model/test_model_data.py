@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.model.model_data import model_from_data, model_to_data
+from srm_mbs.model.model_data import model_from_data, model_to_data, tree_numbers
 from tests.support.bundled import load
 from tests.support.mechanisms import DISTINCT_MODELS
 
@@ -131,3 +131,14 @@ def changed(change: Any) -> Any:
 def test_data_of_no_model_are_refused_with_the_reason(change: Any, says: str) -> None:
     with pytest.raises(srm.InputError, match=says):
         model_from_data(changed(change))
+
+
+def test_numbers_of_a_tree_are_those_of_its_joints_and_bodies() -> None:
+    model = load("stewart_platform").model
+    numbers = tree_numbers(model)
+    for i, (place, body) in enumerate(zip(model.jointPlacements, model.inertias)):
+        R, p = numbers.placements[i, :9].reshape(3, 3), numbers.placements[i, 9:]
+        np.testing.assert_array_equal(R, place.rotation)
+        np.testing.assert_array_equal(p, place.translation)
+        np.testing.assert_array_equal(numbers.bodies[i, :4], [body.mass, *body.lever])
+        np.testing.assert_array_equal(numbers.bodies[i, 4:], body.inertia[np.triu_indices(3)])

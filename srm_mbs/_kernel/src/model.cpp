@@ -16,6 +16,24 @@ const void* model_in(PyObject* object) {
     return found.check() ? &found() : nullptr;
 }
 
+void tree_numbers(const void* from, std::vector<double>& placements, std::vector<double>& bodies) {
+    const auto& model = *static_cast<const pinocchio::Model*>(from);
+    for (int joint = 0; joint < model.njoints; ++joint) {
+        const auto& place = model.jointPlacements[joint];
+        const auto& body = model.inertias[joint];
+        const pinocchio::Inertia::Matrix3 moments = body.inertia().matrix();
+        bodies.push_back(body.mass());
+        for (int i = 0; i < 3; ++i) {
+            for (int j = 0; j < 3; ++j) placements.push_back(place.rotation()(i, j));
+            bodies.push_back(body.lever()[i]);
+        }
+        for (int i = 0; i < 3; ++i) {
+            placements.push_back(place.translation()[i]);
+            for (int j = i; j < 3; ++j) bodies.push_back(moments(i, j));
+        }
+    }
+}
+
 PyObject* lean_data(const void* model) {
     const auto data = std::make_shared<pinocchio::Data>();
     pinocchio_model::prepare(*data, *static_cast<const pinocchio::Model*>(model));

@@ -27,6 +27,7 @@
 #include "linear.hpp"
 #include "manifold.hpp"
 #include "model.hpp"
+#include "regular_start.hpp"
 #include "run.hpp"
 #include "separated_rows.hpp"
 #include "sigma_dips.hpp"
@@ -162,6 +163,7 @@ void bind_structs(nb::module_& m) {
     bind_struct<SeparatedRows>(m, "SeparatedRows");
     bind_struct<ClosingLimits>(m, "ClosingLimits");
     bind_struct<ScaledRows>(m, "ScaledRows");
+    bind_struct<StartRules>(m, "StartRules");
     bind_struct<Extension>(m, "Extension");
     bind_struct<SchemeDense>(m, "SchemeDense");
     bind_struct<DenseConstants>(m, "DenseConstants");
@@ -244,8 +246,17 @@ struct PySystem {
         for (long i = 0; i < repeats; ++i) system->tree_terms(x);
     }
 
-    // Quantities of n states; with the interpreter's lock held, so that threads may share the
-    // workspace.  count_of: their number, from times t (n,) and rows of `width` numbers.
+    // Runs `work` on n states: without the interpreter's lock if there are many of them, so that no
+    // other thread may use the system meanwhile.
+    template <class Work>
+    void on_states(std::size_t n, Work&& work) const {
+        constexpr std::size_t many = 16;
+        if (n < many || !controller.is_none()) return work();
+        const WithoutLock released;
+        work();
+    }
+
+    // Quantities of n states.  count_of: their number, from times t (n,) and rows of `width` numbers.
     static std::size_t count_of(const Array& t, const Array& rows, int width) {
         const std::size_t n = t.size();
         if (t.ndim() != 1 || rows.size() != n * static_cast<std::size_t>(width))
@@ -258,14 +269,17 @@ struct PySystem {
         const std::size_t n = count_of(t, states, state_size()), nx = state_size();
         const auto rows = static_cast<std::size_t>(system->rows());
         std::vector<double> g(n * rows), rates(n * rows), energies(with_energies ? 2 * n : 0);
-        for (std::size_t i = 0; i < n; ++i) {
-            const double* const state = states.data() + i * nx;
-            system->closure_errors(t.data()[i], state, g.data() + i * rows,
-                                   rates.data() + i * rows);
-            if (!with_energies) continue;
-            const auto found = system->energies(state, true);
-            std::copy(found.begin(), found.end(), energies.begin() + 2 * i);
-        }
+        const double *times = t.data(), *x = states.data();
+        on_states(n, [&] {
+            for (std::size_t i = 0; i < n; ++i) {
+                const double* const state = x + i * nx;
+                system->closure_errors(times[i], state, g.data() + i * rows,
+                                       rates.data() + i * rows);
+                if (!with_energies) continue;
+                const auto found = system->energies(state, true);
+                std::copy(found.begin(), found.end(), energies.begin() + 2 * i);
+            }
+        });
         const nb::object errors = owned_array(std::move(g), {n, rows});
         const nb::object of_rates = owned_array(std::move(rates), {n, rows});
         if (!with_energies) return nb::make_tuple(errors, of_rates);
@@ -297,9 +311,12 @@ struct PySystem {
         const int width = system->nv + (system->driven() ? 1 : 0);
         const std::size_t size = rows * static_cast<std::size_t>(width);
         std::vector<double> G(n * size), g(rows);
-        for (std::size_t i = 0; i < n; ++i)
-            system->closures_at(t.data()[i], q.data() + i * system->nq, g.data(),
-                                G.data() + i * size, width);
+        const double *times = t.data(), *from = q.data();
+        on_states(n, [&] {
+            for (std::size_t i = 0; i < n; ++i)
+                system->closures_at(times[i], from + i * system->nq, g.data(), G.data() + i * size,
+                                    width);
+        });
         return owned_array(std::move(G), {n, rows, static_cast<std::size_t>(width)});
     }
 
@@ -313,6 +330,7 @@ struct PySystem {
         return nb::make_tuple(owned_array(std::move(g)), owned_array(std::move(G), {rows, width}));
     }
 
+    // This call and the next ones need a system that no other thread uses meanwhile.
     // close_loops() from q (nq,): the last configuration, and the largest error there.
     nb::tuple close(Algebra& algebra, const Array& row_unit, const Array& units, const Array& q,
                     const ClosingLimits& limits) {
@@ -323,12 +341,39 @@ struct PySystem {
         const double* const unit = vector_of(units, system->nv, "units");
         vector_of(q, system->nq, "q");
         std::vector<double> at = to_vector(q);
-        const double error = close_loops(*system, algebra, over, unit, limits, at);
+        double error;
+        {
+            const WithoutLock released;
+            error = close_loops(*system, algebra, over, unit, limits, at);
+        }
         return nb::make_tuple(owned_array(std::move(at)), error);
     }
 
-    // ScaledSampler::walk() of as many steps as there are reaches; its samples.  With the
-    // interpreter's lock held, so that threads may share the system.
+    // find_regular_start(): q (nq,), v (nv,) and the diagonal; None where it finds none.
+    nb::object regular_start(const StartRules& rules, const Array& q, const Array& v,
+                             std::vector<int> free_q, std::vector<int> free_v,
+                             std::vector<int> turning, const Array& spreads) {
+        const long nv = system->nv;
+        if (system->driven() || system->constrained() || spreads.ndim() != 2 ||
+            static_cast<long>(spreads.shape(1)) != nv)
+            throw nb::value_error("the rows are not unscaled, or spreads not rows of nv numbers");
+        for (const auto* each : {&free_q, &free_v, &turning})
+            expect_within("a coordinate", *each, 0, nv - 1);
+        const StartRequest request{vector_of(q, system->nq, "q"), vector_of(v, system->nv, "v"),
+                                   std::move(free_q), std::move(free_v), std::move(turning),
+                                   spreads.data(), spreads.shape(0)};
+        RegularStart found;
+        bool is_found;
+        {
+            const WithoutLock released;
+            is_found = find_regular_start(*system, rules, request, found);
+        }
+        if (!is_found) return nb::none();
+        return nb::make_tuple(owned_array(std::move(found.q)), owned_array(std::move(found.v)),
+                              found.diagonal);
+    }
+
+    // ScaledSampler::walk() of as many steps as there are reaches; its samples.
     nb::tuple walk(const ScaledRows& rows, Algebra& all, Algebra& loops, Algebra& in_units,
                    const Array& q, bool sample_start, const Array& directions,
                    const Array& reaches, std::optional<Array> first) {
@@ -337,8 +382,12 @@ struct PySystem {
         const std::size_t steps = count_of(reaches, directions, system->nv);
         const double* along = first ? vector_of(*first, system->nv, "first") : nullptr;
         WalkSamples found;
-        sampler.walk(to_vector(q), sample_start, static_cast<int>(steps), directions.data(),
-                     reaches.data(), along, found);
+        std::vector<double> start = to_vector(q);
+        {
+            const WithoutLock released;
+            sampler.walk(std::move(start), sample_start, static_cast<int>(steps),
+                         directions.data(), reaches.data(), along, found);
+        }
         const std::size_t n = found.count;
         const auto each = [&](const Algebra& algebra) {
             return static_cast<std::size_t>(std::min(algebra.rows(), algebra.columns()));
@@ -359,8 +408,12 @@ struct PySystem {
         if (spreads.ndim() != 2 || spreads.shape(1) != nv)
             throw nb::value_error("spreads are not rows of nv numbers");
         std::vector<double> squares(system->rows()), uncancelled(2);
-        sampler.open_norms(to_vector(q), spreads.shape(0), spreads.data(), squares.data(),
-                           uncancelled.data());
+        const std::vector<double> start = to_vector(q);
+        {
+            const WithoutLock released;
+            sampler.open_norms(start, spreads.shape(0), spreads.data(), squares.data(),
+                               uncancelled.data());
+        }
         return nb::make_tuple(owned_array(std::move(squares)), owned_array(std::move(uncancelled)));
     }
 
@@ -369,11 +422,14 @@ struct PySystem {
         const std::size_t n = count_of(t, states, state_size()), nx = state_size();
         const std::size_t m = system->drive_count();
         std::vector<double> out(n * m);
-        for (std::size_t i = 0; i < n; ++i) {
-            system->evaluate(t.data()[i], states.data() + i * nx, System::ZoneView{});
-            if (!system->drive_forces(out.data() + i * m))
-                std::fill_n(out.begin() + i * m, m, std::numeric_limits<double>::quiet_NaN());
-        }
+        const double *times = t.data(), *x = states.data();
+        on_states(n, [&] {
+            for (std::size_t i = 0; i < n; ++i) {
+                system->evaluate(times[i], x + i * nx, System::ZoneView{});
+                if (!system->drive_forces(out.data() + i * m))
+                    std::fill_n(out.begin() + i * m, m, std::numeric_limits<double>::quiet_NaN());
+            }
+        });
         return owned_array(std::move(out), {n, m});
     }
 
@@ -401,12 +457,7 @@ struct PySystem {
                                   on_child.data() + 6 * i * joints);
             }
         };
-        if (controller.is_none()) {  // neither system is shared with another thread
-            const WithoutLock released;
-            find();
-        } else {
-            find();
-        }
+        on_states(n, find);
         return nb::make_tuple(owned_array(std::move(lam), {n, rows}),
                               owned_array(std::move(on_b), {n, closures, 6}),
                               owned_array(std::move(on_child), {n, joints, 6}));
@@ -417,11 +468,14 @@ struct PySystem {
         const std::size_t n = count_of(t, states, state_size()), nx = state_size();
         const auto nv = static_cast<std::size_t>(system->nv);
         std::vector<double> out(n * nv), rate(2 * nv);
-        for (std::size_t i = 0; i < n; ++i) {
-            system->evaluate(t.data()[i], states.data() + i * nx, System::ZoneView{});
-            system->rate(rate.data());
-            std::copy_n(rate.begin() + nv, nv, out.begin() + i * nv);
-        }
+        const double *times = t.data(), *x = states.data();
+        on_states(n, [&] {
+            for (std::size_t i = 0; i < n; ++i) {
+                system->evaluate(times[i], x + i * nx, System::ZoneView{});
+                system->rate(rate.data());
+                std::copy_n(rate.begin() + nv, nv, out.begin() + i * nv);
+            }
+        });
         return owned_array(std::move(out), {n, nv});
     }
 
@@ -435,6 +489,7 @@ struct PySystem {
             static_cast<int>(width) != algebra.columns())
             throw nb::value_error("the rows are not those of the system and of the algebra");
         std::vector<double> out(n), G(all * width);
+        // With the interpreter's lock: threads may share the algebra.
         for (std::size_t i = 0; i < n; ++i)
             out[i] = rows.smallest(*system, algebra, t.data()[i], q.data() + i * system->nq, G);
         return owned_array(std::move(out));
@@ -485,10 +540,13 @@ struct PySystem {
             throw nb::value_error("states has another shape");
         const std::size_t n = states.shape(0);
         std::vector<double> out(2 * n);
-        for (std::size_t i = 0; i < n; ++i) {
-            const auto found = system->energies(states.data() + i * nx);
-            std::copy(found.begin(), found.end(), out.begin() + 2 * i);
-        }
+        const double* const x = states.data();
+        on_states(n, [&] {
+            for (std::size_t i = 0; i < n; ++i) {
+                const auto found = system->energies(x + i * nx);
+                std::copy(found.begin(), found.end(), out.begin() + 2 * i);
+            }
+        });
         return owned_array(std::move(out), {n, 2});
     }
 
@@ -497,8 +555,9 @@ struct PySystem {
                       const std::vector<ForceElement>& elements, bool resting) {
         const std::size_t n = count_of(t, states, state_size()), m = elements.size();
         std::vector<double> out(n * m);
-        system->powers(t.data(), states.data(), n, system->separate(elements), resting,
-                       out.data());
+        const SeparateElements each = system->separate(elements);
+        const double *times = t.data(), *x = states.data();
+        on_states(n, [&] { system->powers(times, x, n, each, resting, out.data()); });
         return owned_array(std::move(out), {n, m});
     }
 
@@ -653,6 +712,9 @@ void bind_system(nb::module_& m) {
         .def("rows_at", &PySystem::rows_at)
         .def("close", &PySystem::close, nb::arg("algebra"), nb::arg("row_unit"), nb::arg("units"),
              nb::arg("q"), nb::arg("limits"))
+        .def("regular_start", &PySystem::regular_start, nb::arg("rules"), nb::arg("q"),
+             nb::arg("v"), nb::arg("free_q"), nb::arg("free_v"), nb::arg("turning"),
+             nb::arg("spreads"))
         .def("walk", &PySystem::walk, nb::arg("rows"), nb::arg("all"), nb::arg("loops"),
              nb::arg("in_units"), nb::arg("q"), nb::arg("sample_start"), nb::arg("directions"),
              nb::arg("reaches"), nb::arg("first").none())
@@ -1525,6 +1587,13 @@ NB_MODULE(_core, m) {
     });
     m.def("lean_data",
           [](nb::object model) { return nb::steal(lean_data(pinocchio_model_in(model))); });
+    m.def("tree_numbers", [](nb::handle model) {
+        std::vector<double> placements, bodies;
+        tree_numbers(pinocchio_model_in(model), placements, bodies);
+        const std::size_t n = placements.size() / 12;
+        return nb::make_tuple(owned_array(std::move(placements), {n, 12}),
+                              owned_array(std::move(bodies), {n, 10}));
+    });
     sleep_at_exit();
     m.def("enter_python", &enter_python);
     m.def("leave_python", &leave_python);

@@ -137,6 +137,15 @@ struct ColumnGroups {
     std::vector<std::vector<int>> groups;      // of coordinates without a common neighbour
 };
 
+enum class RowKind { along, turning, of_joints };
+
+// Rows of one closure and one kind.
+struct RowBlock {
+    int first, count;
+    RowKind kind;
+    double unit;
+};
+
 // Force elements whose powers are separate, each a list of its own.
 struct SeparateElements {
     std::vector<std::vector<ForceElement>> each;
@@ -254,6 +263,12 @@ public:
     void rows_and_mass(const double* q, double* G);
     const double* mass_matrix() const;
     const double* world_jacobian() const;
+    // Where the placements were evaluated last, the diagonal of the bounding box of joints, centres of
+    // mass and anchors; 0 if it is `rounding` over the distance or the gyration (regular_start.cpp).
+    double scene_diagonal(double rounding) const;
+    // The rows that have a usual norm in common, with their units for those of length and of the
+    // coordinates (nv,).
+    void row_blocks(double length, const double* unit, std::vector<RowBlock>& out) const;
     // The coordinates that their differences may move together.
     const ColumnGroups& column_groups();
     int rows() const { return data_.rows; }

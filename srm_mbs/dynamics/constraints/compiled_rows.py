@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel import core
-from srm_mbs._kernel.workspace import workspace
+from srm_mbs._kernel.workspace import LARGE, workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rheonomic import unscaled_rows
 from srm_mbs.dynamics.constraints.row_algebra import CompiledAlgebra, RowAlgebra
@@ -23,6 +24,9 @@ _NO_NUMBERS = np.zeros(0)
 KEPT_SUPPORTS = 2048
 """Closures whose coordinates are kept: variants of a mechanism have the same.  Runs ask for all in
 turn: of a mechanism with more closures none would still be there."""
+
+KEPT_SYSTEMS = 4
+"""Kernel systems of one mechanism that wait for users, at most; of a large mechanism one."""
 
 
 def closure_structs(constants: dict[str, Any]) -> dict[str, Any]:
@@ -72,12 +76,15 @@ class ClosureRows:
     ----------
     g : (m,), G : (m, nv)
         Closure errors and their Jacobian, after :meth:`evaluate`; they are not changed afterwards.
+    idle
+        Kernel systems of the rows, without drives and forces, that nobody uses; None without the
+        kernel.
     """
 
     def __init__(self, model: pin.Model, rows: LoopKinematics) -> None:
         self._model, self._given = model, rows
         self.g, self.G = rows.g, rows.G
-        self._kernel: Any = None
+        self.idle: deque[Any] | None = None
         if core is None:
             return
         count, nv = len(rows.g), int(model.nv)
@@ -106,8 +113,26 @@ class ClosureRows:
             "farthest_node": 0.0,
             "rotation_per_step": 0.0,
         }
-        data = core.SystemData(**fields, **closure_structs(LoopKinematics.constants(rows)))
-        self._kernel = core.System(model, data, None)
+        self._fields = core.SystemData(**fields, **closure_structs(LoopKinematics.constants(rows)))
+        kernel_system = core.System(model, self._fields, None)
+        self.idle = deque((kernel_system,), maxlen=1 if nv > LARGE else KEPT_SYSTEMS)
+
+    def _by_kernel(self, name: str, *arguments: Any) -> Any:
+        """The result of a method of the kernel's system of the rows, which no other thread uses
+        meanwhile; None without the kernel, and where something cannot be evaluated."""
+        idle = self.idle
+        if idle is None:
+            return None
+        try:
+            kernel_system = idle.pop()  # two threads never get the same
+        except IndexError:
+            kernel_system = core.System(self._model, self._fields, None)  # type: ignore[union-attr]
+        try:
+            return getattr(kernel_system, name)(*arguments)
+        except ArithmeticError:
+            return None
+        finally:
+            idle.append(kernel_system)
 
     @cached_property
     def _data(self) -> pin.Data:
@@ -125,21 +150,18 @@ class ClosureRows:
         EvaluationError
             If the points of a ``distance`` coincide.
         """
-        if self._kernel is not None:
-            try:
-                return self._kernel.rows_at(0.0, np.ascontiguousarray(q))  # type: ignore[no-any-return]
-            except ArithmeticError:
-                pass  # the reference raises the error that says why
+        found = self._by_kernel("rows_at", 0.0, np.ascontiguousarray(q))
+        if found is not None:
+            return found  # type: ignore[no-any-return]
+        # The reference raises the error that says why.
         self._rows.evaluate(self._model, self._data, q)
         return self._rows.g.copy(), self._rows.G.copy()
 
     def jacobians(self, q: FloatArray) -> FloatArray:
         """G (n, m, nv) at n configurations q (n, nq), otherwise as :meth:`at`."""
-        if self._kernel is not None:
-            try:
-                return self._kernel.jacobians(np.zeros(len(q)), q)  # type: ignore[no-any-return]
-            except ArithmeticError:
-                pass
+        found: FloatArray | None = self._by_kernel("jacobians", np.zeros(len(q)), q)
+        if found is not None:
+            return found
         return np.array([self.at(each)[1] for each in q])
 
     def evaluate(self, q: FloatArray) -> None:
@@ -169,14 +191,28 @@ class ClosureRows:
         tuple
             The last configuration, and the largest error there, over its unit.
         """
-        if self._kernel is None or not isinstance(algebra, CompiledAlgebra):
+        if self.idle is None or not isinstance(algebra, CompiledAlgebra):
             return None
-        try:
-            return self._kernel.close(  # type: ignore[no-any-return]
-                algebra.compiled, row_unit, units, np.ascontiguousarray(q), limits.compiled()
-            )
-        except ArithmeticError:
-            return None
+        start = np.ascontiguousarray(q)
+        return self._by_kernel(  # type: ignore[no-any-return]
+            "close", algebra.compiled, row_unit, units, start, limits.compiled()
+        )
+
+    def regular_start(
+        self, rules: Any, *request: Any
+    ) -> tuple[FloatArray, FloatArray, float] | None:
+        """The consistent state next to a closed and regular guess, see ``find_regular_start``
+        (regular_start.hpp): q (nq,), v (nv,) and the diagonal (m) of the scene at the guess; None
+        where there is none, and without the kernel.
+
+        Parameters
+        ----------
+        rules
+            The kernel's ``StartRules``.
+        request
+            The fields of ``StartRequest``.
+        """
+        return self._by_kernel("regular_start", rules, *request)  # type: ignore[no-any-return]
 
     def sampler(
         self, algebras: Sequence[RowAlgebra | CompiledAlgebra], limits: Limits, **scaled: Any
@@ -191,11 +227,11 @@ class ClosureRows:
             The other fields of ``ScaledRows`` (manifold.hpp).
         """
         compiled = [each.compiled for each in algebras if isinstance(each, CompiledAlgebra)]
-        if self._kernel is None or len(compiled) < len(algebras):
+        if self.idle is None or len(compiled) < len(algebras):
             return None
         made: Any = core
         scaled_rows = made.ScaledRows(closing=limits.compiled(), **scaled)
-        return CompiledSampler(self._kernel, (scaled_rows, *compiled))
+        return CompiledSampler(self._by_kernel, (scaled_rows, *compiled))
 
 
 @per_model
@@ -245,7 +281,7 @@ class CompiledSampler:
     """Walks of the load-time analysis in one call of the kernel each, from
     :meth:`ClosureRows.sampler`.  What they return is None where anything cannot be evaluated."""
 
-    kernel_system: Any
+    by_kernel: Callable[..., Any]
     rows: tuple[Any, ...]
 
     def walk(
@@ -259,20 +295,14 @@ class CompiledSampler:
         """See ``ScaledSampler::walk``: configurations (n, nq), pivots (n, k) of all rows and
         (n, l) of those of the loops, and the largest norms (rows,) of rows."""
         start = np.ascontiguousarray(q)
-        try:
-            return self.kernel_system.walk(  # type: ignore[no-any-return]
-                *self.rows, start, sample_start, directions, reaches, first
-            )
-        except ArithmeticError:
-            return None
+        return self.by_kernel(  # type: ignore[no-any-return]
+            "walk", *self.rows, start, sample_start, directions, reaches, first
+        )
 
     def open_norms(
         self, q: FloatArray, spreads: FloatArray
     ) -> tuple[FloatArray, FloatArray] | None:
         """See ``ScaledSampler::open_norms``: sums (rows,) and (2,) over the spreads (n, nv)."""
-        try:
-            return self.kernel_system.open_norms(  # type: ignore[no-any-return]
-                *self.rows, np.ascontiguousarray(q), spreads
-            )
-        except ArithmeticError:
-            return None
+        return self.by_kernel(  # type: ignore[no-any-return]
+            "open_norms", *self.rows, np.ascontiguousarray(q), spreads
+        )

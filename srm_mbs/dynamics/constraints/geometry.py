@@ -49,8 +49,9 @@ KEPT_SPREADS = 16
 
 
 @lru_cache(maxsize=KEPT_SPREADS)
-def _spreads(size: int) -> FloatArray:
-    """Motions (n, size) to the open configurations, in units; read-only."""
+def open_spreads(size: int) -> FloatArray:
+    """Motions (n, size) from a start to the open configurations in which the usual norms of rows
+    are measured, in units; read-only."""
     out = np.random.default_rng(0).uniform(-np.pi, np.pi, (OPEN_SAMPLES, size))
     out.setflags(write=False)
     return out
@@ -130,7 +131,7 @@ class ClosureGeometry:
     def _open_configurations(self) -> FloatArray:
         """Open configurations (n, nq), from which usual norms are measured."""
         model = self.model
-        spreads = _spreads(int(model.nv)) * self.coordinate_unit
+        spreads = open_spreads(int(model.nv)) * self.coordinate_unit
         return np.array([pin.integrate(model, self.start, spread) for spread in spreads])
 
     def jacobians(self, places: FloatArray) -> FloatArray:

@@ -164,6 +164,7 @@ def _walked(structure: Structure, mechanism: MechanismData) -> Samples | None:
         return None
     walk = [_steps(int(mechanism.model.nv))]
     samples = sampler.explore_along(start, walk, mechanism.v0, sample_start=True)
+    sampler.end()
     loops = int((samples.of_loops > STRUCTURAL_PIVOT).sum(axis=1).max())
     if int(samples.ranks().max()) != rank or loops != structure.loop_rank:
         return None

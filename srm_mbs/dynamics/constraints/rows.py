@@ -314,6 +314,10 @@ class _LoopRows:
             "first_row": self.first_row,
         }
 
+    def origins(self) -> list[tuple[int, list[float]]]:
+        """Joint, and origin (3,) in its axes, of both anchors."""
+        return [(self.joint_a, self._at_a), (self.joint_b, self._at_b)]
+
     def moved(self, name: str, places: Places) -> _LoopRows | None:
         """The same rows of a closure ``name`` between these places; None if they are on other
         bodies."""
@@ -536,11 +540,10 @@ class LoopKinematics:
             if isinstance(rows, _LoopRows)
         ]
 
-    def anchors(self) -> list[tuple[int, FloatArray]]:
+    def anchors(self) -> list[tuple[int, list[float]]]:
         """Joint, and origin (3,) in its axes, of the anchors of all closures that have rows."""
-        return [
-            (joint, place.translation.copy()) for ends in self.places() for joint, place in ends
-        ]
+        own = [rows for rows in self._loops if isinstance(rows, _LoopRows)]
+        return [end for rows in own for end in rows.origins()]
 
     @property
     def is_constant(self) -> bool:

@@ -10,6 +10,7 @@ Source: docs/notation.md, "Load-time analysis" and "Manifold sampling".
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -111,6 +112,25 @@ def coordinate_tree(mechanism: MechanismData) -> tuple[list[int], list[slice]]:
     return coordinate_parents(mechanism.model), trees(mechanism.model)
 
 
+class SamplerAlgebras(NamedTuple):
+    """The algebra of all rows and of those of the loops in the mass metric, one and the same
+    without drives, and of those of the loops in units."""
+
+    all: RowAlgebra
+    loops: RowAlgebra
+    in_units: RowAlgebra
+
+
+KEPT_ALGEBRAS = 4
+"""Algebras of one pattern that wait for the sampler of the next variant, at most."""
+
+
+@per_tree
+def _idle_algebras(mechanism: MechanismData) -> dict[bytes, deque[SamplerAlgebras]]:
+    """Algebras that no sampler uses, by the pattern of the rows."""
+    return {}
+
+
 class ManifoldSampler:
     """Closes loops and walks on the closure manifold.
 
@@ -140,15 +160,23 @@ class ManifoldSampler:
         self.scale = np.ones(len(rows.g))
         self.eliminations: tuple[Elimination, ...] = ()
         pattern = self._pattern = rows.pattern()
-        closures = [loop for loop in mechanism.loops for _ in loop.row_names]
-        self._anchored = [row for row, loop in enumerate(closures) if not loop.rows.joint_rows]
-        # All rows and those of the loops in the mass metric, those of the loops in units.
         parents, self._trees = coordinate_tree(mechanism)
-        self._all = row_algebra(pattern, parents)
-        driven = self.closed < len(self.scale)
-        self._loops = row_algebra(pattern[: self.closed], parents) if driven else self._all
-        self._in_units = row_algebra(pattern[: self.closed])
+        self._idle = _idle_algebras(mechanism).setdefault(
+            pattern.tobytes(), deque(maxlen=KEPT_ALGEBRAS)
+        )
+        try:
+            self._algebras = self._idle.pop()  # two threads never get the same
+        except IndexError:
+            of_all = row_algebra(pattern, parents)
+            own, driven = pattern[: self.closed], self.closed < len(self.scale)
+            of_loops = row_algebra(own, parents) if driven else of_all
+            self._algebras = SamplerAlgebras(of_all, of_loops, row_algebra(own))
+        self._all, self._loops, self._in_units = self._algebras
         self._factorised: FloatArray | None = None
+
+    def end(self) -> None:
+        """Leave the algebras to the sampler of another variant: this one has no further use."""
+        self._idle.append(self._algebras)
 
     @cached_property
     def data(self) -> pin.Data:
@@ -216,7 +244,7 @@ class ManifoldSampler:
         """Walks by the kernel, with the scale and the eliminations that there are now."""
         rows, others, shares = zip(*self.eliminations) if self.eliminations else ((), (), ())
         return self._rows.sampler(
-            (self._all, self._loops, self._in_units),
+            self._algebras,
             _limits(CLOSING_STEPS),
             scale=self.scale,
             row_unit=self.row_unit,
@@ -302,8 +330,9 @@ class ManifoldSampler:
             Rows that take part.
         """
         groups: dict[bytes, list[int]] = {}
-        for row in self._anchored:
-            if kept[row]:
+        closures = [loop for loop in self._mechanism.loops for _ in loop.row_names]
+        for row, loop in enumerate(closures):
+            if kept[row] and not loop.rows.joint_rows:
                 groups.setdefault(self._pattern[row].tobytes(), []).append(row)
         parts = []
         for q in samples:

@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray, IndexArray
-from srm_mbs.model.model_data import joint_type_data
+from srm_mbs.model.model_data import joint_type_data, tree_numbers
 
 ROUNDING = 2.0**-52
 """Part of a body's moments that is rounding."""
@@ -323,15 +323,13 @@ def _rounded(x: float) -> float:
     return float(nearest) if abs(x - nearest) <= ROTATION_ROUNDING else float(x)
 
 
-def _inertia(body: pin.Inertia) -> list[float]:
+def _inertia(body: Sequence[float]) -> list[float]:
+    """The parameters of a body, a row of :class:`~srm_mbs.model.model_data.TreeNumbers`."""
     # With plain numbers, because NumPy takes several times as long for so few.
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = body.inertia.tolist()
-    moments = (xx, xy, xz, yy, yz, zz)
+    mass, moments = body[0], body[4:]
     rounding = ROUNDING * max(map(abs, moments))
     tensor = [0.0 if abs(moment) <= rounding else moment for moment in moments]
-    if body.mass == 0.0:
-        return [*[0.0] * 4, *tensor]
-    return [float(body.mass), *body.lever.tolist(), *tensor]
+    return [*([0.0] * 4 if mass == 0.0 else body[:4]), *tensor]
 
 
 def _signs(support: FloatArray) -> tuple[tuple[int, int], ...]:
@@ -464,15 +462,13 @@ def parameters_of_variant(
     out = origin.parameters.copy()
     if model.joints.tolist() != own.joints.tolist():
         return None
-    # As lists, because finding the elements one by one takes ten times as long.
-    places = zip(model.jointPlacements.tolist()[1:], own.jointPlacements.tolist()[1:])
-    bodies = zip(model.inertias.tolist()[1:], own.inertias.tolist()[1:])
-    for motion, (at, at_own), (body, body_own) in zip(structure.motions, places, bodies):
-        if at != at_own:
-            placement = [*at.rotation.ravel().tolist(), *at.translation.tolist()]
-            _write(out, motion.placement, [*_turn(placement), *placement[9:]])
-        if body != body_own:
-            _write(out, motion.inertia, _inertia(body))
+    numbers, known_numbers = tree_numbers(model), tree_numbers(own)
+    for joint in _differing_rows(numbers.placements, known_numbers.placements):
+        placement = numbers.placements[joint].tolist()
+        span = structure.motions[joint - 1].placement
+        _write(out, span, [*_turn(placement), *placement[9:]])
+    for joint in _differing_rows(numbers.bodies, known_numbers.bodies):
+        _write(out, structure.motions[joint - 1].inertia, _inertia(numbers.bodies[joint].tolist()))
     if len(constants["loops"]) != len(known["loops"]):
         return None
     for rows, others, closure in zip(constants["loops"], known["loops"], structure.closures):
@@ -492,21 +488,27 @@ def parameters_of_variant(
     return out if same.all() and not (np.abs(values) == 1.0).any() else None
 
 
+def _differing_rows(numbers: FloatArray, others: FloatArray) -> list[int]:
+    """Numbers of the joints, but the universe, whose rows differ."""
+    return (np.flatnonzero((numbers != others)[1:].any(axis=1)) + 1).tolist()
+
+
 def _write(parameters: FloatArray, span: Span, values: Sequence[float] | FloatArray) -> None:
     parameters[span.start : span.start + span.length] = values
 
 
 def _tree(model: pin.Model, numbers: _Numbers) -> tuple[tuple[Motion, ...], tuple[int, ...]]:
+    numbers_of_joints = tree_numbers(model)
     motions: list[Motion] = []
     bodies = [-1]
     massless = [0.0] * 10
     for i in range(1, model.njoints):
-        joint, at = model.joints[i], model.jointPlacements[i]
-        placement = [*at.rotation.ravel().tolist(), *at.translation.tolist()]
+        joint, placement = model.joints[i], numbers_of_joints.placements[i].tolist()
+        body = numbers_of_joints.bodies[i].tolist()
         parts = _parts(joint_type_data(joint), model.names[i], placement)
         parent, in_q, in_v = bodies[int(model.parents[i])], int(joint.idx_q), int(joint.idx_v)
         for part in parts:
-            own = _inertia(model.inertias[i]) if part is parts[-1] else massless
+            own = _inertia(body) if part is parts[-1] else massless
             spans = numbers.take(part.axis, units=True), numbers.take(part.pitch)
             placed = numbers.rotated(part.placement)
             motions.append(Motion(part.kind, parent, in_q, in_v, *spans, placed, numbers.take(own)))

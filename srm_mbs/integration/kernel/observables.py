@@ -11,6 +11,7 @@ import numpy as np
 from srm_mbs._kernel import core
 from srm_mbs._kernel.workspace import LARGE
 from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs.dynamics.constraints.compiled_rows import compiled_rows
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.reactions import Reactions, named_reactions
 from srm_mbs.dynamics.constraints.rheonomic import all_rows, constraint_errors, unscaled_rows
@@ -50,7 +51,14 @@ def _make_all_rows(system: ClosedSystem | OpenSystem) -> Any:
 
 @per_model
 def _idle_all_rows(mechanism: Mechanism) -> deque[Any]:
-    """Those of :func:`_make_all_rows` that nobody uses; of a large mechanism one."""
+    """Those of :func:`_make_all_rows` that nobody uses; of a large mechanism one.
+
+    Without forces, and where moves commute, they are those of assembly and analysis.
+    """
+    known = compiled_rows(mechanism).idle
+    same = not (mechanism.drives or mechanism.forces) and mechanism.model.nq == mechanism.model.nv
+    if known is not None and same:
+        return known
     return deque(maxlen=1 if mechanism.model.nv > LARGE else KEPT)
 
 

@@ -11,7 +11,7 @@ import os
 import pkgutil
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
@@ -210,8 +210,9 @@ def _not_generated(why: str) -> InputError:
     )
 
 
+@lru_cache(maxsize=1)  # who compiles reads it as well
 def source_of_structure(structure: Structure) -> Source:
-    """The C of a structure: some 10 us of CPU time for each statement.
+    """The C of a structure: some 10 us of CPU time for each statement, in each frame that is tried.
 
     Raises
     ------

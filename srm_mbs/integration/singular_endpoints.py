@@ -523,8 +523,8 @@ def _start_by_nodes(system: System, t: float, state: FloatArray, memory: Integra
     branch_system = system.branch_system
     if branch_system is None:
         return False
-    make = getattr(system, "stage_nodes", None)
-    nodes: BranchNodes = BranchNodes(branch_system) if make is None else make
+    by_kernel: BranchNodes | None = getattr(system, "stage_nodes", None)
+    nodes = by_kernel or BranchNodes(branch_system)
     v = state[-system.multiplier_size :]
     try:
         away = nodes.spaced(t, state, v)

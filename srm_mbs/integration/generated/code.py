@@ -210,7 +210,7 @@ def _not_generated(why: str) -> InputError:
     )
 
 
-@lru_cache(maxsize=1)  # who compiles reads it as well
+@lru_cache(maxsize=1)  # the library and the report about it ask for the same
 def source_of_structure(structure: Structure) -> Source:
     """The C of a structure: some 10 us of CPU time for each statement, in each frame that is tried.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from numbers import Integral
@@ -22,7 +22,13 @@ from srm_mbs.formats.build import Reading, assembled
 from srm_mbs.formats.document import Document, RepeatedDocument
 from srm_mbs.formats.registry import DESCRIPTION, LINKAGE, Format, find_format, of_key
 from srm_mbs.formats.toml.description import Description, check_description
-from srm_mbs.formats.toml.parameters import Place, expressions, given_parameters, resolved
+from srm_mbs.formats.toml.parameters import (
+    Place,
+    Resolved,
+    expressions,
+    given_parameters,
+    nested,
+)
 from srm_mbs.formats.translation import KnownTree, Options, TreeParts, merged
 from srm_mbs.formats.urdf.override import override, without_overrides
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
@@ -192,44 +198,35 @@ def _translated(
 
 
 def _varied(
-    own: Document,
-    entries: Mapping[str, Any],
-    given: Description,
-    overrides: Overrides,
-    reach: Reach,
-    urdf: str | None,
-    known: KnownLinkage,
+    known: KnownLinkage, found: Resolved, whole: Callable[[], Source], variants: _Variants
 ) -> Reading | None:
-    """A variant of which nothing but numbers is read; None where it has to be read as a whole.  Its
-    texts are made as those of others when they are asked for."""
-    found = known.varied(given, entries)
-    if found is None:
+    """A variant of which nothing but numbers is read; None where it has to be read as a ``whole``,
+    as its texts are when they are asked for."""
+    varied = known.varied(found.numbers)
+    if varied is None:
         return None
-
-    @cache
-    def whole() -> Source:
-        return _of_tables(own, entries, given, overrides, reach, urdf, None)[0].source
-
-    description = found.elements.description
-    gravity = description.gravity if overrides.gravity is None else overrides.gravity
-    source = Source(
-        SourceTexts(lambda: whole().description, lambda: whole().urdf),
-        urdf_path=known.urdf_path,
-        path=own.file,
-        base=description.base if overrides.base is None else overrides.base,
-        gravity=_gravity(gravity),
-        format=known.format,
-        reach=reach,
-    )
+    source, made = known.source, cache(whole)
     return Reading(
-        description,
-        entries,
+        varied.elements.description,
+        {},
         Element("robot"),
-        source,
-        (*own.notes, *found.notes),
+        Source(
+            SourceTexts(lambda: made().description, lambda: made().urdf),
+            source.urdf_path,
+            source.path,
+            source.base,
+            source.gravity,
+            source.format,
+            source.reach,
+            found.values,
+        ),
+        (*varied.notes, *found.notes),
         None if known.numbers is None else known.numbers.check,
-        model=found.model,
-        elements=found.elements,
+        variants.kind,
+        variants,
+        variants.analysis,
+        model=varied.model,
+        elements=varied.elements,
     )
 
 
@@ -242,22 +239,32 @@ def _of_description(
 ) -> Reading:
     """Read a description; its model file is read from disk unless ``urdf`` is its text.  A variant
     has an ``origin``."""
-    entries, values, notes = resolved(own.toml, overrides.parameters, own.file)
-    given = own
-    own = own if entries is own.toml else Document("", own.file)
-    description = check_description(entries, own.file)
-    known = None if origin is None else origin.known
-    reading, model = _of_tables(own, entries, description, overrides, reach, urdf, known)
-    source = replace(reading.source, parameters=values)
-    notes = (*reading.notes, *notes)
+    found = Resolved(own.toml, overrides.parameters, own.file)
+
+    def whole(known: KnownLinkage | None) -> tuple[Reading, str | None]:
+        entries = found.entries
+        document = own if entries is own.toml else Document("", own.file)
+        description = check_description(entries, own.file)
+        return _of_tables(document, entries, description, overrides, reach, urdf, known)
+
+    variants, known = None, None
     if origin is not None:
-        further = replace(origin, overrides=overrides)
-        analysis, kind = origin.analysis, origin.kind
-        return replace(
-            reading, source=source, notes=notes, variants=further, analysis=analysis, kind=kind
-        )
-    variants = _Variants(given, overrides, reach, model) if values else None
-    return replace(reading, source=source, notes=notes, variants=variants)
+        variants, known = replace(origin, overrides=overrides), origin.known
+        if known is not None and not overrides.entries():
+            varied = _varied(known, found, lambda: whole(None)[0].source, variants)
+            if varied is not None:
+                return varied
+    reading, model = whole(known)
+    if variants is None and found.values:
+        variants = _Variants(own, overrides, reach, model)
+    return replace(
+        reading,
+        source=replace(reading.source, parameters=found.values),
+        notes=(*reading.notes, *found.notes),
+        variants=variants,
+        analysis=None if variants is None else variants.analysis,
+        kind=Mechanism if variants is None else variants.kind,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,11 +309,6 @@ def _of_tables(
 ) -> tuple[Reading, str | None]:
     """Read what a description, whose tables are checked, consists of or names; with the text of its
     model file."""
-    varied = None
-    if known is not None and not overrides.entries():
-        varied = _varied(own, entries, description, overrides, reach, urdf, known)
-    if varied is not None:
-        return varied, None
     if description.planar is not None:
         read = _translated(own, entries, description, LINKAGE, own, overrides, reach, known)
         return read, None
@@ -362,9 +364,11 @@ def _known_linkage(reading: Reading, mechanism: Mechanism, own: Document) -> Kno
     changed = description.lock or description.massless != "refused" or model.armature.any()
     if changed or description.gravity_compensation:
         return None
-    parts, overridable = reading.parts, reading.overridable
-    if mechanism.notes != reading.notes or not _are_overridden(expressions(own.toml)):
-        overridable = None  # what the check of the file notes may be about its numbers
+    parts, overridable, places = reading.parts, reading.overridable, expressions(own.toml)
+    if overridable is not None:
+        # What the check of the file notes may be about its numbers.
+        fits = mechanism.notes == reading.notes and _are_overridden(places, description)
+        overridable = overridable.with_numbers(nested(places)) if fits else None
     if parts is None and overridable is None:
         return None
     tree = KnownTree(parts or TreeParts((), ()), model, mechanism.tree_results)
@@ -372,24 +376,33 @@ def _known_linkage(reading: Reading, mechanism: Mechanism, own: Document) -> Kno
     kept = {loop.name: loop for loop in mechanism.loops}
     described = description.closures()
     closures = tuple(kept[one.name] if kept.get(one.name) == one else one for one in described)
-    numbers = None if reading.vary is None else reading.vary(expressions(own.toml))
     return KnownLinkage(
         tree,
         description,
         reading.entries,
         closures,
         mechanism.points,
-        numbers,
+        replace(reading.source, texts=SourceTexts("", "")),
+        None if reading.vary is None else reading.vary(places),
         overridable,
-        reading.source.urdf_path,
-        reading.source.format,
+        {key: numbers for key, numbers in nested(places).items() if key in VARYING},
     )
 
 
-def _are_overridden(places: Iterable[Place]) -> bool:
-    """Whether all numbers at ``places`` are those of ``[[override]]``, or of elements that are
-    compared with those of the known mechanism."""
-    return all(key in ("override", *VARYING) for key, *_ in places)
+def _are_overridden(places: Iterable[Place], description: Description) -> bool:
+    """Whether all numbers at ``places`` are those of ``[[override]]``, of the start, of points, or
+    of both ends of closures."""
+    for place in places:
+        match place:
+            case ["loop", int(i), "a" | "b", *_]:
+                loop = description.loop[i]
+                if loop.a is None or loop.b is None:
+                    return False
+            case ["override" | "points" | "initial", *_]:
+                pass
+            case _:
+                return False
+    return True
 
 
 def _of_file(path: Path, overrides: Overrides) -> Reading:

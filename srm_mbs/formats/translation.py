@@ -62,28 +62,30 @@ class TreeParts(NamedTuple):
     joints: Sequence[Joint]
 
 
+Vector = tuple[float, float, float]
+
+
 class Numbers(NamedTuple):
     """The numbers of a variant that may differ from those of the mechanism that was read first.
 
     Attributes
     ----------
     joints, inertias
-        Joints of the tree that may have another place, and inertias of links by name.
-    closures, points
-        Tables of both anchors of closures, and of the anchors of points, by name.
-    forces
-        Tables of the anchors of forces, by name and key.
+        Places (m) of joints in their parents, and inertias as Pinocchio's reader has them, by link.
+    closures, points, forces
+        Places (m) of anchors in their links: of closures by name and side, of points by name, of
+        forces by their number in the description and key.
     initial
         The table ``initial``.
     notes
         As of a :class:`Translation`.
     """
 
-    joints: Sequence[Joint]
+    joints: Mapping[str, Vector]
     inertias: Mapping[str, pin.Inertia]
-    closures: Mapping[str, tuple[dict[str, Any], dict[str, Any]]]
-    points: Mapping[str, dict[str, Any]]
-    forces: Mapping[str, dict[str, dict[str, Any]]]
+    closures: Mapping[str, Mapping[str, Vector]]
+    points: Mapping[str, Vector]
+    forces: Mapping[int, Mapping[str, Vector]]
     initial: dict[str, Any]
     notes: tuple[str, ...]
 
@@ -126,9 +128,9 @@ def urdf_text(tree: Element) -> str:
 class NumbersOfVariants(Protocol):
     """Finds the numbers of variants of a linkage."""
 
-    def __call__(self, entry: PlanarEntry) -> Numbers | None:
-        """The numbers of a variant from its section ``[planar]``; None where it has to be read as a
-        whole, because of a fault perhaps."""
+    def __call__(self, numbers: Sequence[float]) -> Numbers | None:
+        """The numbers of a variant from those of the expressions of its description; None where it
+        has to be read as a whole, because of a fault perhaps."""
 
     def check(self, mechanism: Mechanism) -> None:
         """As of a :class:`Translation`."""
@@ -161,8 +163,8 @@ class Translation:
     model
         Pinocchio's model, if it was made from that of a :class:`KnownTree`: ``tree`` is empty.
     vary
-        Makes the numbers of variants from their sections ``[planar]``, for those whose numbers at
-        some places of the description differ; None for places that change more.
+        Makes the numbers of variants from those at some places of the description, where nothing
+        else differs; None for places that change more.
     """
 
     tree: Element

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from operator import attrgetter
 from typing import Any, NamedTuple
 
 import pinocchio as pin
 
 from srm_mbs.errors import InputError
-from srm_mbs.formats.planar.variants import model_with
 from srm_mbs.formats.toml.description import Description, check_description
-from srm_mbs.formats.toml.schema import AnchorEntry, InitialEntry, PlanarEntry
-from srm_mbs.formats.translation import KnownTree, NumbersOfVariants, merged_initial
-from srm_mbs.formats.urdf.override import without_overrides
-from srm_mbs.formats.urdf.variants import OverridableTree
+from srm_mbs.formats.toml.parameters import Nested, with_numbers
+from srm_mbs.formats.toml.schema import InitialEntry
+from srm_mbs.formats.translation import KnownTree, NumbersOfVariants, Vector
+from srm_mbs.formats.urdf.variants import OverridableTree, model_with
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.mechanism import Source
 
 VARYING = ("loop", "points", "initial")
 """Keys of a translated description whose numbers variants change."""
@@ -53,12 +53,14 @@ class KnownLinkage:
         Its checked description, translated, and the tables of this.
     closures, points
         Its closures and named points.
+    source
+        Where it came from, without its texts.
     numbers
         Of variants of a planar linkage, where nothing else of them differs.
     overridable
         What ``[[override]]`` of others may change.
-    urdf_path, format
-        As of its :class:`~srm_mbs.model.mechanism.Source`.
+    varying
+        The numbers of the description of these that variants change otherwise.
     """
 
     tree: KnownTree
@@ -66,10 +68,10 @@ class KnownLinkage:
     entries: Mapping[str, Any]
     closures: tuple[LoopClosure, ...]
     points: Mapping[str, Anchor]
+    source: Source
     numbers: NumbersOfVariants | None = None
     overridable: OverridableTree | None = None
-    urdf_path: str = ""
-    format: str = ""
+    varying: Nested = field(default_factory=dict)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Without the description, whose tables have classes made at run time."""
@@ -78,58 +80,74 @@ class KnownLinkage:
             dict(self.entries),
             self.closures,
             dict(self.points),
+            self.source,
             self.numbers,
             self.overridable,
-            self.urdf_path,
-            self.format,
+            self.varying,
         )
 
-    def varied(self, given: Description, own: Mapping[str, Any]) -> VariedLinkage | None:
-        """The variant with the description ``given``, whose tables are ``own``; None where it has
-        to be read as a whole."""
-        if given.planar is not None:
-            return self._varied_linkage(given.planar, own)
-        if self.overridable is None:
-            return None
-        model = self.overridable.model(self.tree.model, given.override)
-        elements = None if model is None else self.elements(without_overrides(own))
-        return None if elements is None else VariedLinkage(model, elements, ())
-
-    def _varied_linkage(self, entry: PlanarEntry, own: Mapping[str, Any]) -> VariedLinkage | None:
-        if self.numbers is None:
-            return None
+    def varied(self, numbers: Sequence[float]) -> VariedLinkage | None:
+        """The variant with these numbers at the places of its expressions; None where it has to be
+        read as a whole, because of a fault perhaps."""
+        if self.overridable is not None:
+            return self._overridden(self.overridable, numbers)
         try:
-            found = self.numbers(entry)
+            found = None if self.numbers is None else self.numbers(numbers)
         except InputError:
             return None  # reading it as a whole says what is wrong
-        model = None if found is None else model_with(self.tree, found.joints, found.inertias)
-        if found is None or model is None:
+        if found is None:
             return None
-        closures = tuple(
-            closure.between(*(Anchor(**at) for at in found.closures[closure.name]))
-            if closure.name in found.closures
-            else closure
-            for closure in self.closures
+        closures = [
+            _moved(closure, found.closures.get(closure.name, {})) for closure in self.closures
+        ]
+        points = {**self.points, **{k: self.points[k].at(xyz) for k, xyz in found.points.items()}}
+        description = self._starting(found.initial)
+        if found.forces:
+            forces = list(description.force)
+            for i, places in found.forces.items():
+                ends = {
+                    key: getattr(forces[i], key).model_copy(update={"xyz": list(xyz)})
+                    for key, xyz in places.items()
+                }
+                forces[i] = forces[i].model_copy(update=ends)
+            description = description.model_copy(update={"force": forces})
+        number = self.tree.numbers
+        model = model_with(
+            self.tree.model,
+            {number[link]: place for link, place in found.joints.items()},
+            {number[link]: inertia for link, inertia in found.inertias.items()},
         )
+        return self._made(model, description, closures, points, found.notes)
+
+    def _overridden(
+        self, overridable: OverridableTree, numbers: Sequence[float]
+    ) -> VariedLinkage | None:
+        """:meth:`varied` of a URDF."""
+        model = overridable.model(self.tree.model, numbers)
+        if model is None:
+            return None
+        description = with_numbers(self.description, self.varying, numbers)
+        closures, points = list(self.closures), dict(self.points)
+        for i in self.varying.get("loop", ()):
+            a, b = (Anchor(**dict(end)) for end in (description.loop[i].a, description.loop[i].b))
+            closures[i] = closures[i].between(a, b)
+        for name in self.varying.get("points", ()):
+            points[name] = Anchor(**dict(description.points[name]))
+        return self._made(model, description, closures, points)
+
+    def _made(
+        self,
+        model: pin.Model,
+        description: Description,
+        closures: Sequence[LoopClosure],
+        points: dict[str, Anchor],
+        notes: tuple[str, ...] = (),
+    ) -> VariedLinkage | None:
+        """A variant; None if two of its closures are the same."""
         if not _all_different(closures):
             return None
-        points = dict(self.points)
-        named = own.get("points", {})
-        points |= {name: Anchor(**at) for name, at in found.points.items() if name not in named}
-        initial = merged_initial(own.get("initial", {}), found.initial)
-        description = self._starting(initial)
-        if found.forces:
-            anchors = {
-                name: {key: AnchorEntry.model_validate(at) for key, at in ends.items()}
-                for name, ends in found.forces.items()
-            }
-            forces = [
-                entry.model_copy(update=anchors.get(entry.name)) for entry in description.force
-            ]
-            description = description.model_copy(update={"force": forces})
-        return VariedLinkage(
-            model, Elements(description, closures, points, self.tree.results), found.notes
-        )
+        elements = Elements(description, tuple(closures), points, self.tree.results)
+        return VariedLinkage(model, elements, notes)
 
     def _starting(self, initial: Mapping[str, Any]) -> Description:
         """The description with the table ``initial``, whose numbers are checked."""
@@ -181,6 +199,16 @@ class KnownLinkage:
                 closure = closure.between(Anchor(**ends["a"]), Anchor(**ends["b"]))
             found.append(closure)
         return tuple(found) if _all_different(found) else None
+
+
+def _moved(closure: LoopClosure, places: Mapping[str, Vector]) -> LoopClosure:
+    """A closure with its ends at other ``places`` in their links, by side."""
+    if not places:
+        return closure
+    a, b = closure.anchors
+    return closure.between(
+        a.at(places["a"]) if "a" in places else a, b.at(places["b"]) if "b" in places else b
+    )
 
 
 def _all_different(closures: Sequence[LoopClosure]) -> bool:

@@ -64,6 +64,10 @@ class Anchor:
         """Name of the link or frame."""
         return str(self.link if self.link is not None else self.frame)
 
+    def at(self, xyz: tuple[float, float, float]) -> Anchor:
+        """The same anchor with another origin (3,) m."""
+        return Anchor(self.link, self.frame, xyz, self.rpy)
+
     def resolve(self, model: pin.Model) -> tuple[int, pin.SE3]:
         """Joint that carries the anchor (0: ground) and the anchor's placement in that joint.
 

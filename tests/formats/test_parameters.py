@@ -15,7 +15,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.cli.model_file import parameter_values
-from srm_mbs.formats.toml.parameters import resolved
+from srm_mbs.formats.toml.parameters import Resolved
 from tests.support.bundled import load
 from tests.support.commands import error_line, row, run
 from tests.support.snapshots import check_refusals
@@ -92,9 +92,9 @@ def same(a: srm.Mechanism, b: srm.Mechanism) -> bool:
 def test_an_expression_is_the_number_that_arithmetic_gives(expression: str, value: float) -> None:
     table = {"a": 0.25, "b": 3, "c": "=2*b"}
     entries = {"parameters": table, "gravity": [0, expression, 0]}
-    found, values, _ = resolved(entries, {}, "a.toml")
-    assert found == {"gravity": [0, value, 0]}
-    assert values == {"a": 0.25, "b": 3.0, "c": 6.0}
+    found = Resolved(entries, {}, "a.toml")
+    assert found.entries == {"gravity": [0, value, 0]}
+    assert found.values == {"a": 0.25, "b": 3.0, "c": 6.0}
 
 
 @pytest.mark.parametrize("crank", [0.3, 0.31])
@@ -119,7 +119,7 @@ def test_a_variant_is_the_mechanism_loaded_with_its_values(linkage: Path) -> Non
 
 def test_a_parameter_that_nothing_uses_is_noted() -> None:
     entries = {"parameters": {"a": 1.0, "b": 2.0}, "friction_speed": "=a"}
-    assert resolved(entries, {}, "a.toml")[2] == ("no expression uses the parameters 'b'",)
+    assert Resolved(entries, {}, "a.toml").notes == ("no expression uses the parameters 'b'",)
 
 
 def test_runs_and_conversions_keep_the_numbers(linkage: Path, tmp_path: Path) -> None:
@@ -187,7 +187,7 @@ def test_faults_of_the_table_of_a_file_do_not_name_the_option(
 def test_messages_about_parameters(linkage: Path) -> None:
     def speed(expression: Any, **table: Any) -> Callable[[], object]:
         entries = {"parameters": {"crank": 1.0, **table}, "friction_speed": expression}
-        return partial(resolved, entries, {}, "a.toml")
+        return partial(Resolved, entries, {}, "a.toml")
 
     def given(values: Any) -> Callable[[], object]:
         return partial(srm.load, "four_bar", parameters=values)
@@ -216,12 +216,12 @@ def test_messages_about_parameters(linkage: Path) -> None:
             "value": speed("=a", a=True),
             "name of a function": speed("=1", sin=2.0),
             "unusual name": speed("=1", **{"bar-length": 2.0}),
-            "no table": partial(resolved, {"parameters": 3}, {}, "a.toml"),
+            "no table": partial(Resolved, {"parameters": 3}, {}, "a.toml"),
             "value of an unknown": partial(
-                resolved, {"parameters": {"a": 1.0}, "name": "x"}, {"b": 1.0}, "a.toml"
+                Resolved, {"parameters": {"a": 1.0}, "name": "x"}, {"b": 1.0}, "a.toml"
             ),
             "value that nothing uses": partial(
-                resolved, {"parameters": {"a": 1.0}, "name": "x"}, {"a": 2.0}, "a.toml"
+                Resolved, {"parameters": {"a": 1.0}, "name": "x"}, {"a": 2.0}, "a.toml"
             ),
             "value of a text": given({"crank": "long"}),
             "values of a list": given([1.0]),

@@ -9,13 +9,17 @@ from functools import lru_cache
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple, Self
 
-import numpy as np
-
-from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, known_names, naming
 from srm_mbs.formats.files import check_name
 from srm_mbs.formats.graph.joint_graph import ROOT_JOINT
-from srm_mbs.formats.planar.shapes import direction_angle, fitted, own_axes, turned
+from srm_mbs.formats.planar.shapes import (
+    Point,
+    difference,
+    direction_angle,
+    fitted,
+    own_axes,
+    turned,
+)
 from srm_mbs.formats.toml.schema import LENGTH_UNITS, PlanarBar, PlanarEntry, PlanarSlider
 from srm_mbs.model.anchors import WORLD
 from srm_mbs.model.lazy import cached_property
@@ -78,6 +82,10 @@ class Change(NamedTuple):
     bodies: frozenset[str]
     masses: frozenset[str]
 
+    def reaches(self, body: str, point: str) -> bool:
+        """Whether a point may be elsewhere in a body."""
+        return body in self.bodies or point in self.points
+
 
 class Drawing:
     """The points of a linkage, and where the bodies that they lie on have them.
@@ -92,9 +100,11 @@ class Drawing:
     unit, angle
         Factors to m and rad.
     points
-        Positions (2,) in m as drawn, by name.
+        Positions in m as drawn, by name.
     bars, sliders
         By name.
+    order
+        Names of the points of each bar, from that at which it begins.
     ground
         Names of the points on the ground.
     bodies
@@ -114,8 +124,7 @@ class Drawing:
         self._check_names()
         self._known_nearest: dict[frozenset[str], float] = {}
         """Results of :meth:`_nearest`."""
-        self.bars: dict[str, PlanarBar] = {bar.name: bar for bar in entry.bar}
-        self.sliders: dict[str, PlanarSlider] = {each.name: each for each in entry.slider}
+        self.order: dict[str, list[str]] = {bar.name: bar.points for bar in entry.bar}
         self.bodies = (WORLD, *self.bars, *(s.name for s in entry.slider if s.mass))
         self._check_ground()
         for bar in entry.bar:
@@ -126,18 +135,18 @@ class Drawing:
             self._check_slider(slider)
         self._check_use()
         self._check_lengths()
-        self._shapes = {name: self._shape(bar) for name, bar in self.bars.items()}
+        self._shapes = {name: self._shape(name) for name in self.bars}
 
     def _draw(self, entry: PlanarEntry) -> None:
-        """Take the places of all points from ``entry``."""
-        self.entry = entry
-        drawn = self.unit * np.array(list(entry.points.values()), dtype=float)
-        self.points: dict[str, FloatArray] = dict(zip(entry.points, drawn))
-        self._places = {name: (x, y) for name, (x, y) in zip(self.points, drawn.tolist())}
-        """The points as plain numbers."""
-        self._angles: dict[str, float] = {}
-        """Results of :meth:`body_angle` for bars."""
-        self.size = float(np.linalg.norm(np.ptp(drawn, axis=0))) if len(drawn) else 0.0
+        """Take the numbers of ``entry``."""
+        self.entry, unit = entry, self.unit
+        self.points: dict[str, Point] = {
+            name: (unit * x, unit * y) for name, (x, y) in entry.points.items()
+        }
+        self.bars: dict[str, PlanarBar] = {bar.name: bar for bar in entry.bar}
+        self.sliders: dict[str, PlanarSlider] = {each.name: each for each in entry.slider}
+        sides = [max(side) - min(side) for side in zip(*self.points.values())]
+        self.size = math.sqrt(sum(side * side for side in sides))
         """Diagonal (m) of the drawing."""
 
     def varied(self, entry: PlanarEntry, change: Change) -> Self | None:
@@ -145,20 +154,11 @@ class Drawing:
         differs; None where a check may refuse it, or where bodies gain or lose their mass."""
         out = copy(self)
         out._draw(entry)
-        out.bars, out._shapes = dict(self.bars), dict(self._shapes)
-        out.sliders = {each.name: each for each in entry.slider}
-        changed = change.bodies | change.masses
-        for bar in entry.bar:
-            if bar.name in changed:
-                own = self.bars[bar.name].points
-                out.bars[bar.name] = (
-                    bar if bar.points == own else bar.model_copy(update={"points": own})
-                )
         if not SIZES[0] <= out.size <= SIZES[1] or not out._is_plain(self, change):
             return None
-        for name in self.bars:
-            if name in change.bodies:
-                out._shapes[name] = out._shape(out.bars[name])
+        out._shapes = self._shapes | {
+            name: out._shape(name) for name in self.bars if name in change.bodies
+        }
         return out
 
     def _is_plain(self, other: Drawing, change: Change) -> bool:
@@ -213,8 +213,8 @@ class Drawing:
         if not named:
             raise fault("planar", "the linkage has no bar", "Give bars, each with its points")
 
-    def point(self, name: str, element: str) -> FloatArray:
-        """Position (2,) of a point in m as drawn; errors are about ``element``."""
+    def point(self, name: str, element: str) -> Point:
+        """Position of a point in m as drawn; errors are about ``element``."""
         if name not in self.points:
             raise fault(element, f"there is no point {name!r}", known_names(self.points))
         return self.points[name]
@@ -301,7 +301,7 @@ class Drawing:
 
     def _apart(self, a: str, b: str) -> float:
         """Distance (m) of two points as drawn."""
-        return math.dist(self._places[a], self._places[b])
+        return math.dist(self.points[a], self.points[b])
 
     def carriers(self, point: str) -> list[str]:
         """The bodies that have a point: the ground, bars, and sliders with mass."""
@@ -327,7 +327,7 @@ class Drawing:
 
     def coinciding(self) -> list[tuple[str, str]]:
         """Pairs of different points at one place of the drawing."""
-        order = sorted(self.points, key=self._places.__getitem__)
+        order = sorted(self.points, key=self.points.__getitem__)
         return [(a, b) for a, b in pairwise(order) if self._apart(a, b) <= COINCIDENT * self.size]
 
     def direction(self, slider: PlanarSlider) -> float:
@@ -337,52 +337,49 @@ class Drawing:
         if not isinstance(along, list):
             return self.angle * float(along)
         if all(isinstance(part, str) for part in along):
-            vector = self.point(along[1], element) - self.point(along[0], element)
+            vector = difference(self.point(along[1], element), self.point(along[0], element))
         else:
-            vector = np.array(along, dtype=float)
-        if not np.linalg.norm(vector):
+            vector = along[0], along[1]
+        if not any(vector):
             raise fault(element, "its line has no direction", "Give a direction that is not zero")
         return direction_angle(vector)
 
     def begin(self, bar: str, point: str) -> None:
         """Let a bar begin at one of its points."""
-        points = self.bars[bar].points
-        if points[0] == point:
-            return
-        others = [name for name in points if name != point]
-        self.bars[bar] = self.bars[bar].model_copy(update={"points": [point, *others]})
-        self._shapes[bar] = self._shape(self.bars[bar])
-        self._angles.pop(bar, None)
+        points = self.order[bar]
+        if points[0] != point:
+            self.order[bar] = [point, *(name for name in points if name != point)]
+            self._shapes[bar] = self._shape(bar)
 
     def body_angle(self, body: str) -> float:
         """Angle (rad) of the x axis of a body as drawn: of a bar, from the first to the second of
         its points; of a slider, that of the bar on which it slides."""
-        if body in self.bars:
-            if body not in self._angles:
-                first, second = self.bars[body].points[:2]
-                self._angles[body] = direction_angle(self.points[second] - self.points[first])
-            return self._angles[body]
+        if body in self.order:
+            first, second, *_ = self.order[body]
+            return direction_angle(difference(self.points[second], self.points[first]))
         on = self.sliders[body].on if body in self.sliders else ""
         return self.body_angle(on) if on else 0.0
 
-    def _lengths(self, bar: PlanarBar) -> dict[tuple[int, int], float]:
-        """The given lengths (m) between points of a bar, by their indices in it."""
-        out = {} if bar.length is None else {(0, 1): self.unit * bar.length}
+    def _lengths(self, bar: str) -> dict[tuple[int, int], float]:
+        """The given lengths (m) between points of a bar, by their indices in its order."""
+        length, points = self.bars[bar].length, self.order[bar]
+        out = {} if length is None else {(0, 1): self.unit * length}
         for each in self.entry.length:
-            if set(each.between) <= set(bar.points):
-                i, j = sorted(map(bar.points.index, each.between))
+            if set(each.between) <= set(points):
+                i, j = sorted(map(points.index, each.between))
                 out[i, j] = self.unit * each.length
         return out
 
-    def _shape(self, bar: PlanarBar) -> FloatArray:
-        """The points (n, 2) of a bar in its own axes."""
-        given = self._lengths(bar)
-        if len(bar.points) == 2:
-            length = given.get((0, 1), self._apart(*bar.points))
-            return np.array([[0.0, 0.0], [length, 0.0]])
-        drawn = np.array([self.points[name] for name in bar.points])
-        with naming(element=f"bar {bar.name!r}"):
-            return own_axes(fitted(drawn, given) if given else drawn)
+    def _shape(self, bar: str) -> list[Point]:
+        """The points of a bar in its own axes."""
+        given, points = self._lengths(bar), self.order[bar]
+        if len(points) == 2:
+            return [(0.0, 0.0), (given.get((0, 1), self._apart(*points)), 0.0)]
+        drawn = [self.points[name] for name in points]
+        if given:
+            with naming(element=f"bar {bar!r}"):
+                drawn = fitted(drawn, given)
+        return own_axes(drawn)
 
     def _check_lengths(self) -> None:
         """Refuse lengths between points that no bar has, and of another order than the drawing."""
@@ -399,20 +396,21 @@ class Drawing:
             if not any(set(each.between) <= set(bar.points) for bar in self.entry.bar):
                 raise fault(element, "no bar has both points", "Give two points of one bar")
 
-    def shape(self, bar: str) -> FloatArray:
-        """The points (n, 2) of a bar in its own axes (m), in its order."""
+    def shape(self, bar: str) -> list[Point]:
+        """The points of a bar in its own axes (m), in its order."""
         return self._shapes[bar]
 
-    def on_body(self, body: str, at: FloatArray, point: str = "") -> FloatArray:
-        """A place of the drawing (2,), that of the point if it is one of a bar, in axes of a body
-        whose origin is the ground's, the first point of a bar, or the point of a slider."""
-        if body in self.bars:
-            bar = self.bars[body]
-            if point in bar.points:
-                return np.asarray(self._shapes[body][bar.points.index(point)])
-            return turned(at - self.points[bar.points[0]], -self.body_angle(body))
+    def on_body(self, body: str, at: Point, point: str = "") -> Point:
+        """A place of the drawing, that of the point if it is one of a bar, in axes of a body whose
+        origin is the ground's, the first point of a bar, or the point of a slider."""
+        if body in self.order:
+            points = self.order[body]
+            if point in points:
+                return self._shapes[body][points.index(point)]
+            return turned(difference(at, self.points[points[0]]), -self.body_angle(body))
         if body in self.sliders:
-            return turned(at - self.points[self.sliders[body].point], -self.body_angle(body))
+            origin = self.points[self.sliders[body].point]
+            return turned(difference(at, origin), -self.body_angle(body))
         return at
 
 

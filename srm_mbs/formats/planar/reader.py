@@ -13,18 +13,17 @@ from there to the next of its points: the angle of a pin on the ground is that o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import lru_cache, partial
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.errors import InputError, known_names, naming
 from srm_mbs.formats.document import Document
@@ -41,23 +40,36 @@ from srm_mbs.formats.planar.drawing import Change, Drawing, fault, listed
 from srm_mbs.formats.planar.shapes import (
     GREY,
     PALETTE,
+    PlanarInertia,
+    Point,
     bar_visuals,
     block,
-    body_inertia,
+    difference,
     direction_angle,
     in_space,
     pin_visual,
     rod,
     slender,
-    slender_body,
     turned,
 )
 from srm_mbs.formats.planar.variants import model_of_variant, plain_parts
-from srm_mbs.formats.toml.parameters import Place
+from srm_mbs.formats.toml.parameters import Place, nested, with_numbers
 from srm_mbs.formats.toml.schema import PlanarEntry, PlanarSlider
-from srm_mbs.formats.translation import PLANAR, Numbers, Options, Translation, urdf_text
+from srm_mbs.formats.translation import (
+    PLANAR,
+    Numbers,
+    Options,
+    Translation,
+    Vector,
+    merged_initial,
+    urdf_text,
+)
+from srm_mbs.formats.urdf.variants import inertia_as_read
 from srm_mbs.model.anchors import WORLD
 from srm_mbs.model.lazy import cached_property
+from srm_mbs.model.numbers import LARGEST_MAGNITUDE
+
+Key = TypeVar("Key", str, int)
 
 HINGE_AXIS = (0.0, -1.0, 0.0)
 """Axis of all pins, in the axes of the world."""
@@ -91,6 +103,15 @@ def translate(document: Document, options: Options) -> Translation:
         if options.own.get("base", "fixed") != "fixed":
             raise fault("base", "a planar linkage stands on its ground", "Remove base")
         return _Linkage(options.planar, options).translation()
+
+
+def _as_written(point: Point) -> Vector:
+    """A point of a link in its frame, in space, as files give it: rounding of its origin is left
+    out, and signs of zeros."""
+    x, y = point
+    if max(abs(x), abs(y)) <= IDENTITY_ROUNDING:
+        return 0.0, 0.0, 0.0
+    return x + 0.0, 0.0, y + 0.0
 
 
 class _Connections(NamedTuple):
@@ -179,14 +200,11 @@ class _Linkage:
         self.joints = self._tree()
         for joint in self.joints:
             if joint.type == "revolute" and joint.child in self.drawing.bars:
-                self.drawing.begin(joint.child, self._point(joint))
-        self.origins = {WORLD: np.zeros(2)} | {
-            joint.child: self.drawing.on_body(joint.child, self._drawn(joint), self._point(joint))
-            for joint in self.joints
+                self.drawing.begin(joint.child, self.point(joint))
+        self.origins: dict[str, Point] = {WORLD: (0.0, 0.0)} | {
+            joint.child: self._on_body(joint.child, self.point(joint)) for joint in self.joints
         }
         """Of the links, in the axes of :meth:`Drawing.on_body`."""
-        self._local_places: dict[tuple[str, str], FloatArray] = {}
-        """Results of :meth:`_local`."""
 
     # -- the graph ---------------------------------------------------------------------------
 
@@ -271,29 +289,27 @@ class _Linkage:
 
     # -- geometry ----------------------------------------------------------------------------
 
-    def _point(self, joint: Joint) -> str:
+    def point(self, joint: Joint) -> str:
         return self.points_of_joints[joint.name]
 
-    def _drawn(self, joint: Joint) -> FloatArray:
-        return self.drawing.points[self._point(joint)]
+    def _on_body(self, body: str, point: str) -> Point:
+        """A point in the axes of :meth:`Drawing.on_body`."""
+        return self.drawing.on_body(body, self.drawing.points[point], point)
 
-    def _local(self, body: str, point: str) -> FloatArray:
-        """A point (2,) in the frame of the link of a body."""
-        key = body, point
-        if key not in self._local_places:
-            drawing = self.drawing
-            at = drawing.on_body(body, drawing.points[point], point)
-            self._local_places[key] = at - self.origins[body]
-        return self._local_places[key]
+    def _local(self, body: str, point: str) -> Point:
+        """A point in the frame of the link of a body."""
+        return difference(self._on_body(body, point), self.origins[body])
 
     def _at(self, body: str, point: str) -> pin.SE3:
         return pin.SE3(UNTURNED, in_space(self._local(body, point)))
 
+    def place(self, body: str, point: str) -> Vector:
+        """A point in the frame of the link of a body, as files give it."""
+        return _as_written(self._local(body, point))
+
     def _anchor(self, body: str, point: str) -> dict[str, Any]:
-        x, y = self._local(body, point).tolist()
-        if max(abs(x), abs(y)) <= IDENTITY_ROUNDING:
-            return {"link": body}
-        return {"link": body, "xyz": [x + 0.0, 0.0, y + 0.0]}
+        place = self.place(body, point)
+        return {"link": body, "xyz": list(place)} if any(place) else {"link": body}
 
     def _carrier(self, point: str, element: str) -> str:
         """The body on which a point is fixed."""
@@ -303,13 +319,11 @@ class _Linkage:
             raise fault(element, f"point {point!r} is on no bar", "Give it to a bar, or to ground")
         return self.connections.hubs[point]
 
-    def _line(self, slider: PlanarSlider, normal: bool = False) -> tuple[float, float, float]:
+    def line(self, slider: PlanarSlider, normal: bool = False) -> tuple[float, float, float]:
         """Direction of the line of a slider, or its normal, in the body on which it slides."""
         angle = self.drawing.direction(slider) - self.drawing.body_angle(slider.on)
-        unit = turned(np.array([1.0, 0.0]), angle + (0.5 * math.pi if normal else 0.0))
-        unit[np.abs(unit) < 1e-15] = 0.0
-        x, y, z = in_space(unit).tolist()
-        return (x, y + 0.0, z)
+        x, y = turned((1.0, 0.0), angle + (0.5 * math.pi if normal else 0.0))
+        return (0.0 if abs(x) < 1e-15 else x, 0.0, 0.0 if abs(y) < 1e-15 else y)
 
     # -- the tree ----------------------------------------------------------------------------
 
@@ -325,7 +339,7 @@ class _Linkage:
             "loop": list(self._closures()),
             "force": list(self._forces()),
             "drive": list(self._drives()),
-            "initial": self._initial(),
+            "initial": self.initial(),
         }
         entries |= {key: tables for key, tables in found.items() if tables}
         entries["points"] = {
@@ -338,7 +352,7 @@ class _Linkage:
             Element("robot") if model is not None else self._urdf(drawn=False),
             lambda: urdf_text(self._urdf(drawn=True)),
             entries,
-            tuple(self._notes()),
+            tuple(self.notes()),
             check=self.check,
             parts=plain_parts(bodies, joints) if model is None else None,
             model=model,
@@ -348,7 +362,11 @@ class _Linkage:
     @cached_property
     def _parts(self) -> tuple[list[Body], list[Joint]]:
         """Bodies, without what is drawn, and the joints of the tree."""
-        bodies = [Body(name, self._inertia(name)) for name in self.bodies[1:]]
+        inertias = {name: self.inertia(name) for name in self.bodies[1:]}
+        bodies = [
+            Body(name, None if inertia is None else inertia.in_space())
+            for name, inertia in inertias.items()
+        ]
         return bodies, list(map(self._placed, self.joints))
 
     def _urdf(self, drawn: bool) -> Element:
@@ -365,22 +383,24 @@ class _Linkage:
 
     def _placed(self, joint: Joint) -> Joint:
         """A joint of the tree with its frame on the parent; that on the child is the link's."""
-        place, axis = self._at(joint.parent, self._point(joint)), HINGE_AXIS
+        place, axis = self._at(joint.parent, self.point(joint)), HINGE_AXIS
         if joint.type != "revolute":
             slider = self.drawing.sliders[joint.name]
-            x, y, z = self._line(slider)
+            x, y, z = self.line(slider)
             axis = (x, y, z) if joint.child == slider.name else (-x, y, -z)
         return Joint(joint.name, joint.type, joint.parent, joint.child, place, axis=axis)
 
-    def _inertia(self, body: str) -> pin.Inertia | None:
+    def inertia(self, body: str) -> PlanarInertia | None:
+        """Inertia of a body in the frame of its link."""
         drawing = self.drawing
         if body in drawing.sliders:
             slider = drawing.sliders[body]
-            tensor = np.diag([0.5, 1.0, 0.5]) * slider.inertia
+            half = 0.5 * slider.inertia
+            tensor = (half, 0.0, slider.inertia, half)
             at = self._local(body, slider.point)
-            return body_inertia(slider.mass, at, tensor) if slider.mass else None
-        bar = drawing.bars[body]
-        shape = slender(drawing.shape(body) - self.origins[body])
+            return PlanarInertia(slider.mass, at, tensor) if slider.mass else None
+        bar, origin = drawing.bars[body], self.origins[body]
+        shape = slender([difference(point, origin) for point in drawing.shape(body)])
         mass = bar.mass
         if mass is None:
             density = bar.mass_per_length
@@ -390,9 +410,10 @@ class _Linkage:
             return None
         centre = shape.centre
         if bar.centre is not None:
-            place = drawing.unit * np.array(bar.centre)
-            centre = drawing.on_body(body, place) - self.origins[body]
-        return slender_body(shape, mass, centre, bar.inertia)
+            x, y = bar.centre
+            place = drawing.on_body(body, (drawing.unit * x, drawing.unit * y))
+            centre = difference(place, origin)
+        return shape.body(mass, centre, bar.inertia)
 
     # -- closures, forces, start ---------------------------------------------------------------
 
@@ -400,14 +421,14 @@ class _Linkage:
         """A cut pin is a point, a slot a point on a line of the plane: out of the plane, rows of a
         closure are zero."""
         for joint in self.cut:
-            point = self._point(joint)
+            point = self.point(joint)
             a, b = self._anchor(joint.child, point), self._anchor(joint.parent, point)
             if joint.type == "revolute":
                 yield {"name": joint.name, "type": "point", "a": a, "b": b}
                 continue
             slider = self.drawing.sliders[joint.name]
             if joint.type == "slot":
-                normal = list(self._line(slider, normal=True))
+                normal = list(self.line(slider, normal=True))
                 yield {"name": joint.name, "type": "point_on_plane", "a": a, "b": b, "axis": normal}
                 continue
             yield closure(
@@ -415,7 +436,7 @@ class _Linkage:
                 joint.name,
                 (joint.parent, self._at(joint.parent, point)),
                 (joint.child, self._at(joint.child, point)),
-                self._line(slider),
+                self.line(slider),
                 fault=partial(fault, f"slider {joint.name!r}"),
             )
 
@@ -485,18 +506,26 @@ class _Linkage:
                     table[key] = values.tolist()
             yield {"joint": joint, **table}
 
-    def _initial(self) -> dict[str, Any]:
+    def initial(self, angles: Mapping[str, float] | None = None) -> dict[str, Any]:
+        """The table ``initial``, with the guessed ``angles`` of revolute joints, if they are known,
+        by name."""
         start = {name: self._factor(name) * value for name, value in self.entry.start.items()}
-        angles = {}
-        for joint in self.joints:
-            if joint.type == "revolute" and joint.name not in start:
-                turn = self.drawing.body_angle(joint.child) - self.drawing.body_angle(joint.parent)
-                angles[joint.name] = math.remainder(turn, 2.0 * math.pi)
+        if angles is None:
+            angles = {
+                joint.name: self.angle(joint)
+                for joint in self.joints
+                if joint.type == "revolute" and joint.name not in start
+            }
         rates = {name: self._factor(name) * value for name, value in self.entry.rates.items()}
         parts = {"q": start, "v": rates, "guess": angles}
         return {part: values for part, values in parts.items() if values}
 
-    def _notes(self) -> Iterator[str]:
+    def angle(self, joint: Joint) -> float:
+        """Angle (rad) of a revolute joint as drawn."""
+        turn = self.drawing.body_angle(joint.child) - self.drawing.body_angle(joint.parent)
+        return math.remainder(turn, 2.0 * math.pi)
+
+    def notes(self) -> Iterator[str]:
         for a, b in self.drawing.coinciding():
             yield (
                 f"the points {a!r} and {b!r} coincide as drawn and are two pins: nothing joins "
@@ -547,76 +576,17 @@ class _Linkage:
                 bars.add(slider.name)
         return Change(frozenset(points), frozenset(bars), frozenset(masses))
 
-    @staticmethod
-    def _varies(body: str, point: str, change: Change) -> bool:
-        """Whether a point may be elsewhere in a body."""
-        return body in change.bodies or point in change.points
-
     def varied(self, entry: PlanarEntry, change: Change) -> _Linkage | None:
         """The same linkage with the numbers of ``entry``; None as for :meth:`Drawing.varied`."""
         drawing = self.drawing.varied(entry, change)
         if drawing is None:
             return None
         out = copy(self)
-        out.entry, out.drawing = entry, drawing
-        out.origins = dict(self.origins)
+        out.entry, out.drawing, out.origins = entry, drawing, dict(self.origins)
         for joint in self.joints:
-            point = self._point(joint)
-            if self._varies(joint.child, point, change):
-                out.origins[joint.child] = drawing.on_body(joint.child, out._drawn(joint), point)
-        out._local_places = {
-            place: at
-            for place, at in self._local_places.items()
-            if not self._varies(*place, change)
-        }
+            if change.reaches(joint.child, self.point(joint)):
+                out.origins[joint.child] = out._on_body(joint.child, self.point(joint))
         return out
-
-    def numbers(self, first: _Linkage, change: Change) -> Numbers | None:
-        """The numbers that differ from those of the linkage ``first``, of which this is a variant;
-        None if an axis differs, or whether a body has mass."""
-        moved = []
-        for own, placed in zip(self.joints, first._parts[1]):
-            varies = self._varies(own.parent, self._point(own), change)
-            if varies or own.type != "revolute":
-                joint = self._placed(own)
-                if joint.axis != placed.axis:
-                    return None
-                if varies:
-                    moved.append(joint)
-        heavier = {}
-        for body in first._parts[0]:
-            if body.name in change.bodies or body.name in change.masses:
-                inertia = self._inertia(body.name)
-                if (inertia is None) != (body.inertia is None):
-                    return None
-                if inertia is not None:
-                    heavier[body.name] = inertia
-        closures = {}
-        for joint in self.cut:
-            if joint.type != "revolute":
-                slider = self.drawing.sliders[joint.name]
-                if self._line(slider) != first._line(slider):
-                    return None
-            point = self._point(joint)
-            if self._varies(joint.child, point, change) or self._varies(
-                joint.parent, point, change
-            ):
-                closures[joint.name] = (
-                    self._anchor(joint.child, point),
-                    self._anchor(joint.parent, point),
-                )
-        points = {
-            point: self._anchor(body, point)
-            for point, body in self.connections.hubs.items()
-            if self._varies(body, point, change)
-        }
-        forces: dict[str, dict[str, Any]] = {
-            table["name"]: {key: table[key] for key in ("a", "b", "at") if key in table}
-            for table in self._forces()
-            if table["type"] != "torque"
-        }
-        notes = tuple(self._notes())
-        return Numbers(moved, heavier, closures, points, forces, self._initial(), notes)
 
     # -- visuals -------------------------------------------------------------------------------
 
@@ -641,16 +611,18 @@ class _Linkage:
         width, layer = self._width, self._width * 1.2 * self._layers[body]
         if body in self.drawing.sliders:
             slider = self.drawing.sliders[body]
-            angle = direction_angle(np.array(self._line(slider))[[0, 2]])
+            x, _, z = self.line(slider)
+            angle = direction_angle((x, z))
             return (block(self._local(body, slider.point), angle, layer, width),)
         index = list(self.drawing.bars).index(body)
-        points = self.drawing.shape(body) - self.origins[body]
+        origin = self.origins[body]
+        points = [difference(point, origin) for point in self.drawing.shape(body)]
         bars = bar_visuals(points, layer, width, PALETTE[index % len(PALETTE)])
         return (*bars, *self._bolts(body))
 
     def _bolts(self, body: str) -> Iterator[Element]:
         """The bolts of the pins whose bodies are joined with this one."""
-        for point in dict.fromkeys(self.drawing.bars[body].points):
+        for point in dict.fromkeys(self.drawing.order[body]):
             bodies = self.drawing.carriers(point)
             if len(bodies) > 1 and next(name for name in bodies if name != WORLD) == body:
                 layers = [1.2 * self._width * self._layers[name] for name in bodies]
@@ -666,7 +638,7 @@ class _Linkage:
             if not slider.on:
                 at, along = (
                     in_space(self.drawing.points[slider.point]),
-                    np.array(self._line(slider)),
+                    np.array(self.line(slider)),
                 )
                 reach = 0.25 * self.drawing.size * along
                 yield rod(at - reach, at + reach, 0.25 * width, GREY)
@@ -693,12 +665,108 @@ class LinkageVariants:
 
     def __init__(self, linkage: _Linkage, change: Change, places: tuple[Place, ...]) -> None:
         self._linkage, self._change, self._places = linkage, change, places
+        own, entry, reaches = linkage.options.own, linkage.entry, change.reaches
+        self._numbers = nested(places)[PLANAR]
+        self._least = [
+            (k, math.ulp(0.0) if place[-1] == "length" else 0.0)
+            for k, place in enumerate(places)
+            if place[-1] in NUMBERS_OF_BARS
+        ]
+        """Numbers that have a least value, by their place in the order of ``places``, and this."""
+        self._lines = {
+            slider.name: linkage.line(slider)
+            for slider in entry.slider
+            if slider.on in change.bodies
+            or (isinstance(slider.along, list) and not change.points.isdisjoint(slider.along))
+        }
+        """Lines of sliders that may have another direction, as first read."""
+        self._bodies = {
+            body: linkage.inertia(body) is None
+            for body in linkage.bodies[1:]
+            if body in change.bodies or body in change.masses
+        }
+        """Bodies that may have another inertia, and whether they have none."""
+        hubs, joints = linkage.connections.hubs, linkage.joints
+        self._joints = {
+            joint.child: (joint.parent, linkage.point(joint))
+            for joint in joints
+            if reaches(joint.parent, linkage.point(joint))
+        }
+        """Bodies and points that may be elsewhere in them, by the links that joints there carry."""
+        self._closures = {
+            joint.name: ends
+            for joint in linkage.cut
+            for point in [linkage.point(joint)]
+            if (ends := self._ends(a=(joint.child, point), b=(joint.parent, point)))
+        }
+        self._points = {
+            point: (body, point)
+            for point, body in hubs.items()
+            if point not in own.get("points", ()) and reaches(body, point)
+        }
+        forces = [
+            *(
+                self._ends(a=(hubs[each.a], each.a), b=(hubs[each.b], each.b))
+                for each in entry.spring
+            ),
+            *({} for _ in entry.torque),
+            *(self._ends(at=(hubs[each.point], each.point)) for each in entry.load),
+        ]
+        self._forces = {
+            number: ends for number, ends in enumerate(forces, len(own.get("force", ()))) if ends
+        }
+        """As those of joints: of closures, points and forces."""
+        self._angles = {
+            joint.name: linkage.angle(joint)
+            for joint in joints
+            if joint.type == "revolute" and joint.name not in entry.start
+        }
+        self._turning = [
+            joint
+            for joint in joints
+            if joint.name in self._angles
+            and not change.bodies.isdisjoint((joint.child, joint.parent))
+        ]
 
-    def __call__(self, entry: PlanarEntry) -> Numbers | None:
-        """The numbers of a variant with the section ``entry``; None where it has to be read as a
+    def _ends(self, **ends: tuple[str, str]) -> dict[str, tuple[str, str]]:
+        """Those of the ``ends``, each a body and a point, that may be elsewhere in the body."""
+        return {key: end for key, end in ends.items() if self._change.reaches(*end)}
+
+    def __call__(self, numbers: Sequence[float]) -> Numbers | None:
+        """The numbers of the variant with these at the places; None where it has to be read as a
         whole, because of a fault perhaps."""
+        if any(numbers[k] < least for k, least in self._least):
+            return None
+        entry = with_numbers(self._linkage.entry, self._numbers, numbers)
         varied = self._linkage.varied(entry, self._change)
-        return None if varied is None else varied.numbers(self._linkage, self._change)
+        if varied is None or any(
+            varied.line(varied.drawing.sliders[name]) != line for name, line in self._lines.items()
+        ):
+            return None
+        place = varied.place
+        joints = {link: place(*at) for link, at in self._joints.items()}
+        sizes: list[tuple[float, ...]] = [*joints.values()]
+        inertias = {}
+        for body, massless in self._bodies.items():
+            inertia = varied.inertia(body)
+            if (inertia is None) != massless:
+                return None
+            if inertia is not None:
+                inertias[body] = _as_read(inertia)
+                sizes += [(inertia.mass, *inertia.centre), inertia.tensor]
+        # Everything here is a real body: other checks of the tree have nothing to say.
+        if not all(abs(x) <= LARGEST_MAGNITUDE for values in sizes for x in values):
+            return None
+        angles = self._angles | {joint.name: varied.angle(joint) for joint in self._turning}
+        return Numbers(
+            joints,
+            inertias,
+            _places(place, self._closures),
+            {name: place(*at) for name, at in self._points.items()},
+            _places(place, self._forces),
+            merged_initial(self._linkage.options.own.get("initial", {}), varied.initial(angles)),
+            tuple(varied.notes()),
+        )
 
     def check(self, mechanism: Mechanism) -> None:
         """Refuse a linkage that cannot move."""
@@ -717,3 +785,15 @@ def _variants_again(
     linkage = _Linkage(entry, Options(cut, own, planar=entry))
     linkage.translation()
     return linkage.variants(places)
+
+
+def _places(
+    place: Callable[[str, str], Vector], ends: Mapping[Key, Mapping[str, tuple[str, str]]]
+) -> dict[Key, dict[str, Vector]]:
+    """Places of the ends of elements."""
+    return {key: {side: place(*at) for side, at in own.items()} for key, own in ends.items()}
+
+
+def _as_read(inertia: PlanarInertia) -> pin.Inertia:
+    """The inertia as Pinocchio's reader of URDF has it."""
+    return inertia_as_read(inertia.mass, _as_written(inertia.centre), inertia.matrix())

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -25,9 +24,6 @@ FIT_ITERATIONS = 100
 """Newton steps after which lengths are taken for impossible."""
 DIVERGED = 1e12
 """Coordinates over the largest of the lengths at which Newton's method has failed."""
-KEPT_SHAPES = 1024
-"""Bars whose shapes, slender bodies and inertias are kept: variants of a linkage have most of them
-in common."""
 COLLINEAR = 1e-12
 """Distance of points from a line, over the size of the bar, that is rounding."""
 PALETTE = (
@@ -43,45 +39,41 @@ GREY = (0.55, 0.57, 0.6, 1.0)
 DARK = (0.15, 0.16, 0.18, 1.0)
 
 
-def in_space(point: FloatArray, layer: float = 0.0) -> FloatArray:
+Point = tuple[float, float]
+"""x and y of the drawing (m): plain numbers, since NumPy takes ten times as long for so few."""
+
+
+def in_space(point: Point, layer: float = 0.0) -> FloatArray:
     """The point (x, y) of the drawing in the world, (x, -layer, y), in m."""
     return np.array([point[0], -layer, point[1]])
 
 
-def turned(point: FloatArray, angle: float) -> FloatArray:
-    """``point`` (2,), turned by ``angle`` (rad), counter-clockwise."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([c * point[0] - s * point[1], s * point[0] + c * point[1]])
+def difference(a: Point, b: Point) -> Point:
+    """a - b."""
+    return a[0] - b[0], a[1] - b[1]
 
 
-def direction_angle(vector: FloatArray) -> float:
-    """Angle (rad) of a vector (2,) against x, in (-pi, pi]."""
-    return float(np.arctan2(vector[1], vector[0]))
+def turned(point: Point, angle: float) -> Point:
+    """``point``, turned by ``angle`` (rad), counter-clockwise."""
+    c, s = math.cos(angle), math.sin(angle)
+    return c * point[0] - s * point[1], s * point[0] + c * point[1]
 
 
-def own_axes(points: FloatArray) -> FloatArray:
-    """Points (n, 2) in axes that begin at the first of them, with x towards the second; nothing may
-    change the result, which is the same object for the same points."""
-    return _own_axes(points.shape, points.tobytes())
+def direction_angle(vector: Point) -> float:
+    """Angle (rad) of a vector against x, in (-pi, pi]."""
+    return math.atan2(vector[1], vector[0])
 
 
-@lru_cache(maxsize=KEPT_SHAPES)
-def _own_axes(shape: tuple[int, ...], numbers: bytes) -> FloatArray:
-    """:func:`own_axes` from the bytes of the points."""
-    points = np.frombuffer(numbers).reshape(shape)
-    angle = direction_angle(points[1] - points[0])
-    # With plain numbers, because NumPy takes ten times as long for so few.
-    c, s = float(np.cos(-angle)), float(np.sin(-angle))
-    along = (points - points[0]).tolist()
-    places = [(c * x - s * y, s * x + c * y) for x, y in along]
+def own_axes(points: Sequence[Point]) -> list[Point]:
+    """Points in axes that begin at the first of them, with x towards the second."""
+    angle = direction_angle(difference(points[1], points[0]))
+    places = [turned(difference(point, points[0]), -angle) for point in points]
     rounding = COLLINEAR * max(max(abs(x), abs(y)) for x, y in places)
-    out = np.array([[0.0 if abs(a) < rounding else a for a in place] for place in places])
-    out.setflags(write=False)
-    return out
+    return [(0.0 if abs(x) < rounding else x, 0.0 if abs(y) < rounding else y) for x, y in places]
 
 
-def fitted(points: FloatArray, lengths: Mapping[tuple[int, int], float]) -> FloatArray:
-    """The points (n, 2) next to ``points`` that have given distances.
+def fitted(points: Sequence[Point], lengths: Mapping[tuple[int, int], float]) -> list[Point]:
+    """The points next to ``points`` that have given distances.
 
     Newton's method on the squared distances, with the shortest of all corrections at each step.
 
@@ -103,7 +95,7 @@ def fitted(points: FloatArray, lengths: Mapping[tuple[int, int], float]) -> Floa
         apart = np.array([out[i] - out[j] for i, j in pairs])
         residual = wanted**2 - (apart**2).sum(axis=1)
         if np.abs(residual).max() <= FIT_TOLERANCE * wanted.max() ** 2:
-            return out
+            return [(x, y) for x, y in out.tolist()]
         rows = np.zeros((len(pairs), out.size))
         for row, (i, j), d in zip(rows, pairs, apart):
             row[2 * i : 2 * i + 2] = 2.0 * d
@@ -116,23 +108,22 @@ def fitted(points: FloatArray, lengths: Mapping[tuple[int, int], float]) -> Floa
     )
 
 
-def outline(points: FloatArray) -> list[tuple[int, int]]:
-    """Edges of the convex hull of points (n, 2), as pairs of indices: one if they are in line.
+def outline(points: Sequence[Point]) -> list[tuple[int, int]]:
+    """Edges of the convex hull of points, as pairs of indices: one if they are in line.
 
     A. M. Andrew, Information Processing Letters 9 (1979) 216.
     """
     if len(points) == 2:
         return [(0, 1)]
-    at = points.tolist()
-    order = sorted(range(len(at)), key=at.__getitem__)
-    (left, right), (bottom, top) = ((min(side), max(side)) for side in zip(*at))
+    order = sorted(range(len(points)), key=points.__getitem__)
+    (left, right), (bottom, top) = ((min(side), max(side)) for side in zip(*points))
     rounding = COLLINEAR * max(right - left, top - bottom) ** 2
 
     def chain(indices: Iterable[int]) -> list[int]:
         found: list[int] = []
         for i in indices:
             while len(found) > 1:
-                (px, py), (ax, ay), (bx, by) = at[found[-2]], at[found[-1]], at[i]
+                (px, py), (ax, ay), (bx, by) = points[found[-2]], points[found[-1]], points[i]
                 if (ax - px) * (by - py) - (ay - py) * (bx - px) > rounding:
                     break
                 found.pop()
@@ -145,43 +136,65 @@ def outline(points: FloatArray) -> list[tuple[int, int]]:
     return list(zip(ring, [*ring[1:], ring[0]]))
 
 
-@dataclass(frozen=True, eq=False)
-class Slender:
+class PlanarInertia(NamedTuple):
+    """Inertia of a body in the plane.
+
+    Attributes
+    ----------
+    mass
+        kg.
+    centre
+        Centre of mass.
+    tensor
+        xx, xz, yy and zz about it (kg m^2), in the axes x, -y, z of :func:`in_space`; xy and yz are
+        zero.
+    """
+
+    mass: float
+    centre: Point
+    tensor: tuple[float, float, float, float]
+
+    def in_space(self) -> pin.Inertia:
+        """The same for Pinocchio."""
+        out = pin.Inertia(self.mass, in_space(self.centre), np.zeros((3, 3)))
+        out.inertia = self.matrix()  # unchecked: the check of the tree does
+        return out
+
+    def matrix(self) -> FloatArray:
+        """The tensor (3, 3)."""
+        xx, xz, yy, zz = self.tensor
+        return np.array([[xx, 0.0, xz], [0.0, yy, 0.0], [xz, 0.0, zz]])
+
+
+class Slender(NamedTuple):
     """Slender bars of 1 kg in all along the outline of points.
 
     Attributes
     ----------
     length
         Of all bars (m).
-    centre : (2,)
+    centre
         Centre of mass (m).
-    tensor : (3, 3)
-        Inertia about it (m^2, for 1 kg), in the axes x, -y, z of :func:`in_space`.
+    tensor
+        As of a :class:`PlanarInertia` (m^2, for 1 kg).
     """
 
     length: float
-    centre: FloatArray
-    tensor: FloatArray
+    centre: Point
+    tensor: tuple[float, float, float, float]
+
+    def body(self, mass: float, centre: Point, moment: float | None) -> PlanarInertia:
+        """A body of ``mass`` (kg) about its ``centre``, with this tensor, scaled to a ``moment``
+        (kg m^2) in the plane if there is one."""
+        xx, xz, yy, zz = self.tensor
+        moment = mass * yy if moment is None else moment
+        tensor = (moment * xx / yy, moment * xz / yy, moment * yy / yy, moment * zz / yy)
+        return PlanarInertia(mass, centre, tensor)
 
 
-def slender(points: FloatArray) -> Slender:
-    """The slender bars along the :func:`outline` of points (n, 2); nothing may change the result,
-    which is the same object for the same points."""
-    return _slender(points.shape, points.tobytes())
-
-
-@lru_cache(maxsize=KEPT_SHAPES)
-def _slender(shape: tuple[int, ...], numbers: bytes) -> Slender:
-    """:func:`slender` from the bytes of the points, which tell signs of zeros apart."""
-    points = np.frombuffer(numbers).reshape(shape)
-    at = points.tolist()  # plain numbers, as in own_axes
-    if len(at) == 2:
-        (a, b), (c, d) = at
-        p, q = c - a, d - b
-        xx, xy, yy = p * p / 12.0, p * q / 12.0, q * q / 12.0
-        tensor = np.array([[yy, 0.0, -xy], [0.0, xx + yy, 0.0], [-xy, 0.0, xx]])
-        return Slender(math.hypot(p, q), np.array([0.5 * (a + c), 0.5 * (b + d)]), tensor)
-    ends = [(*at[i], *at[j]) for i, j in outline(points)]
+def slender(points: Sequence[Point]) -> Slender:
+    """The slender bars along the :func:`outline` of points."""
+    ends = [(*points[i], *points[j]) for i, j in outline(points)]
     parts = [math.hypot(c - a, d - b) for a, b, c, d in ends]
     length = math.fsum(parts)
     weights = [part / length for part in parts]
@@ -194,39 +207,7 @@ def _slender(shape: tuple[int, ...], numbers: bytes) -> Slender:
         xx += w * (p * p / 12.0 + u * u)
         xy += w * (p * q / 12.0 + u * v)
         yy += w * (q * q / 12.0 + v * v)
-    tensor = np.array([[yy, 0.0, -xy], [0.0, xx + yy, 0.0], [-xy, 0.0, xx]])
-    return Slender(length, np.array([x, y]), tensor)
-
-
-def slender_body(
-    shape: Slender, mass: float, centre: FloatArray, moment: float | None
-) -> pin.Inertia:
-    """Inertia of a body of ``mass`` (kg) about its ``centre`` (2,): that of slender bars, scaled to
-    a ``moment`` (kg m^2) in the plane if there is one; nothing may change the result."""
-    return _slender_body(shape, float(mass), centre.tobytes(), moment)
-
-
-@lru_cache(maxsize=KEPT_SHAPES)
-def _slender_body(shape: Slender, mass: float, centre: bytes, moment: float | None) -> pin.Inertia:
-    """:func:`slender_body` from the bytes of the centre."""
-    turning = shape.tensor[1, 1]
-    moment = mass * turning if moment is None else moment
-    return body_inertia(mass, np.frombuffer(centre), moment * shape.tensor / turning)
-
-
-def body_inertia(mass: float, centre: FloatArray, tensor: FloatArray) -> pin.Inertia:
-    """Inertia of a body of ``mass`` (kg) with its centre of mass at (x, y), from the tensor
-    (3, 3) about it (kg m^2); nothing may change the result, which is the same object for the same
-    body."""
-    return _body_inertia(float(mass), centre.tobytes(), tensor.tobytes())
-
-
-@lru_cache(maxsize=KEPT_SHAPES)
-def _body_inertia(mass: float, centre: bytes, tensor: bytes) -> pin.Inertia:
-    """:func:`body_inertia` from the bytes of the arrays."""
-    out = pin.Inertia(mass, in_space(np.frombuffer(centre)), np.zeros((3, 3)))
-    out.inertia = np.frombuffer(tensor).reshape((3, 3))  # unchecked: the check of the tree does
-    return out
+    return Slender(length, (x, y), (yy, -xy, xx + yy, xx))
 
 
 def rod(start: FloatArray, end: FloatArray, radius: float, rgba: Sequence[float]) -> Element:
@@ -239,9 +220,9 @@ def rod(start: FloatArray, end: FloatArray, radius: float, rgba: Sequence[float]
 
 
 def bar_visuals(
-    points: FloatArray, layer: float, width: float, rgba: Sequence[float]
+    points: Sequence[Point], layer: float, width: float, rgba: Sequence[float]
 ) -> tuple[Element, ...]:
-    """A bar as it is drawn: rods along its outline and discs on its points (n, 2).
+    """A bar as it is drawn: rods along its outline and discs on its points.
 
     ``layer`` is its distance (m) from the plane, ``width`` that of the rods.
     """
@@ -256,14 +237,14 @@ def bar_visuals(
     return (*rods, *discs)
 
 
-def pin_visual(point: FloatArray, layers: Sequence[float], width: float) -> Element:
-    """The bolt through the bars in ``layers`` (m) at a point (2,)."""
+def pin_visual(point: Point, layers: Sequence[float], width: float) -> Element:
+    """The bolt through the bars in ``layers`` (m) at a point."""
     first, last = min(layers) - 0.7 * width, max(layers) + 0.7 * width
     return rod(in_space(point, first), in_space(point, last), 0.3 * width, DARK)
 
 
-def block(point: FloatArray, angle: float, layer: float, width: float) -> Element:
-    """The sliding block at a point (2,), turned by ``angle`` (rad)."""
+def block(point: Point, angle: float, layer: float, width: float) -> Element:
+    """The sliding block at a point, turned by ``angle`` (rad)."""
     rotation = pin.rpy.rpyToMatrix(0.0, -angle, 0.0)
     sizes = {"size": numbers([3.0 * width, width, 2.0 * width])}
     return visual(pin.SE3(rotation, in_space(point, layer)), "box", sizes, DARK)

@@ -7,16 +7,15 @@ would compute them; texts, the check of the XML and Pinocchio's reader are left 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs._kernel.workspace import share_scratch
 from srm_mbs.formats.graph.joint_graph import Body, Joint
 from srm_mbs.formats.graph.spanning_tree_to_urdf import is_identity
 from srm_mbs.formats.translation import KnownTree, TreeParts
-from srm_mbs.formats.urdf.variants import inertia_as_read, plain_numbers
+from srm_mbs.formats.urdf.variants import inertia_as_read, model_with, plain_numbers
 
 UNTURNED = np.eye(3)
 
@@ -41,38 +40,34 @@ def model_of_variant(
     """
     if known is None or not _same_tree(known.parts, bodies, joints):
         return None
-    heavier = {
+    inertias = {
         body.name: body.inertia
         for body, own in zip(bodies, known.parts.bodies)
         if body.inertia is not None and body.inertia != own.inertia
     }
-    moved = [
-        joint for joint, own in zip(joints, known.parts.joints) if joint.in_parent != own.in_parent
-    ]
-    return model_with(known, moved, heavier)
-
-
-def model_with(
-    known: KnownTree, moved: Sequence[Joint], inertias: Mapping[str, pin.Inertia]
-) -> pin.Model | None:
-    """The model of ``known`` with other translations of the joints ``moved`` and other ``inertias``
-    of links, by name; None where the check of a tree would say something about them."""
-    if not plain_numbers(list(inertias.values()), [joint.in_parent for joint in moved]):
+    places = {
+        joint.child: joint.in_parent
+        for joint, own in zip(joints, known.parts.joints)
+        if joint.in_parent != own.in_parent
+    }
+    if not plain_numbers(inertias.values(), places.values()):
         return None
-    model = known.model.copy()
-    share_scratch(known.model, model)
-    for joint in moved:
-        number = known.numbers[joint.child]
-        place = joint.in_parent
-        at = np.zeros(3) if is_identity(place) else place.translation + 0.0
-        model.jointPlacements[number] = pin.SE3(model.jointPlacements[number].rotation, at)
-    for link, inertia in inertias.items():
-        centre = pin.SE3(UNTURNED, inertia.lever)
-        lever = np.zeros(3) if is_identity(centre) else inertia.lever
-        model.inertias[known.numbers[link]] = inertia_as_read(
-            inertia.mass, lever.tobytes(), inertia.inertia.tobytes()
-        )
-    return model
+    numbers = known.numbers
+    return model_with(
+        known.model,
+        {numbers[link]: _as_written(place) for link, place in places.items()},
+        {
+            numbers[link]: inertia_as_read(
+                own.mass, _as_written(pin.SE3(UNTURNED, own.lever)), own.inertia
+            )
+            for link, own in inertias.items()
+        },
+    )
+
+
+def _as_written(place: pin.SE3) -> list[float]:
+    """The translation of a place as a file gives it, which leaves out the identity."""
+    return [0.0] * 3 if is_identity(place) else [x + 0.0 for x in place.translation]
 
 
 def _same_tree(known: TreeParts, bodies: Sequence[Body], joints: Sequence[Joint]) -> bool:

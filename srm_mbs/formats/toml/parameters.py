@@ -11,13 +11,16 @@ import ast
 import keyword
 import math
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel
 
 from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.formats.files import shortened
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_number, named_values
 
 LONGEST_EXPRESSION = 200
@@ -33,6 +36,8 @@ TABLE = "[parameters]"
 
 Place = tuple[str | int, ...]
 """Keys and indices that lead to a value of a description."""
+Nested = dict[Any, Any]
+"""Numbers of values of a description by their places, one table in the other."""
 
 BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
@@ -66,23 +71,26 @@ def is_expression(value: Any) -> bool:
     return isinstance(value, str) and value.startswith("=")
 
 
-def resolved(
-    entries: Mapping[str, Any], given: Mapping[str, float], file: str
-) -> tuple[Mapping[str, Any], dict[str, float], tuple[str, ...]]:
-    """A description with numbers in place of its expressions, and without its parameters.
+class Resolved:
+    """A description whose expressions have values.
 
     Parameters
     ----------
-    entries
-        The tables of the description, as ``tomllib`` gives them; they are left as they are.
+    tables
+        Its tables, as ``tomllib`` gives them; they are left as they are.
     given
-        Values instead of those of the file.
+        Values of parameters instead of those of the file.
+    file
+        Name of the file in messages.
 
-    Returns
-    -------
-    entries, values, notes
-        The same object if it has neither expressions nor parameters; the values of all parameters;
-        a note about those that nothing uses.
+    Attributes
+    ----------
+    numbers
+        Of the expressions, in the order of :func:`expressions`.
+    values
+        Of all parameters.
+    notes
+        One about parameters that nothing uses, if there are any.
 
     Raises
     ------
@@ -90,29 +98,39 @@ def resolved(
         Naming file, key, expression and remedy; also for a value of a parameter that is unknown or
         that nothing uses.
     """
-    try:
-        known = _Parameters(entries.get(PARAMETERS, {}), given)
-        rest = {key: value for key, value in entries.items() if key != PARAMETERS}
-        places = _expressions(_Tables(entries)) if PARAMETERS in entries else _places(rest, ())
-        numbers = known.in_place(rest, places)
-        values = known.values()
-    except InputError as error:
-        error.file = error.file or file
-        raise
-    idle = [name for name in values if name not in known.used]
-    for name in given:
-        if name in idle:
-            raise InputError(
-                f"nothing in the description uses the parameter {name!r}",
-                file=file,
-                element=PARAMETERS,
-                remedy=f'Use it in an expression, as "={name}", or leave its value out',
-            )
-    if not known.changed and PARAMETERS not in entries:
-        return entries, {}, ()
-    names = ", ".join(map(repr, idle))
-    notes = (f"no expression uses the parameters {names}",) if idle else ()
-    return numbers, values, notes
+
+    def __init__(self, tables: Mapping[str, Any], given: Mapping[str, float], file: str) -> None:
+        self._tables = tables
+        try:
+            known = _Parameters(tables.get(PARAMETERS, {}), given)
+            self.numbers = [
+                known.evaluated(text, key) for text, key in _expressions(_Tables(tables)).texts
+            ]
+            self.values = known.values()
+        except InputError as error:
+            error.file = error.file or file
+            raise
+        idle = [name for name in self.values if name not in known.used]
+        for name in given:
+            if name in idle:
+                raise InputError(
+                    f"nothing in the description uses the parameter {name!r}",
+                    file=file,
+                    element=PARAMETERS,
+                    remedy=f'Use it in an expression, as "={name}", or leave its value out',
+                )
+        names = ", ".join(map(repr, idle))
+        self.notes = (f"no expression uses the parameters {names}",) if idle else ()
+
+    @cached_property
+    def entries(self) -> Mapping[str, Any]:
+        """The tables with numbers in place of expressions, and without parameters; the same object
+        if there are neither."""
+        if not self.numbers and PARAMETERS not in self._tables:
+            return self._tables
+        rest = {key: value for key, value in self._tables.items() if key != PARAMETERS}
+        changed = _expressions(_Tables(self._tables)).nested
+        return dict(with_numbers(rest, changed, self.numbers))
 
 
 class _Parameters:
@@ -150,27 +168,10 @@ class _Parameters:
         self._values: dict[str, float] = {}
         self._open: list[str] = []
         self.used: set[str] = set()
-        self.changed = False
 
     def values(self) -> dict[str, float]:
         """All values, in the order of the file."""
         return {name: self._value(name) for name in self._table}
-
-    def in_place(self, tables: dict[str, Any], places: Iterable[Place]) -> dict[str, Any]:
-        """``tables`` with numbers in place of the expressions at ``places``; what has none is not
-        copied."""
-        out = dict(tables)
-        copies: dict[Place, Any] = {(): out}
-        for place in places:
-            inside: Any = out
-            for k, part in enumerate(place[:-1], 1):
-                if place[:k] not in copies:
-                    copies[place[:k]] = inside[part] = copy(inside[part])
-                inside = copies[place[:k]]
-            self.changed = True
-            key = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in place[1:])
-            inside[place[-1]] = self._evaluated(inside[place[-1]], f"{place[0]}{''.join(key)}")
-        return out
 
     def _value(self, name: str) -> float:
         """The value of a parameter that there is."""
@@ -196,7 +197,7 @@ class _Parameters:
 
     def _defined(self, value: Any, key: str) -> float:
         if is_expression(value):
-            return self._evaluated(value, key)
+            return self.evaluated(value, key)
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not number or not abs(value) <= LARGEST_MAGNITUDE:
             raise InputError(
@@ -206,7 +207,7 @@ class _Parameters:
             )
         return float(value)
 
-    def _evaluated(self, text: str, key: str) -> float:
+    def evaluated(self, text: str, key: str) -> float:
         """The value of the expression ``text`` of ``key``."""
         shown = repr(shortened(text))
         if len(text) > LONGEST_EXPRESSION:
@@ -305,21 +306,75 @@ class _Tables:
         return id(self.entries)
 
 
+class _Expressions(NamedTuple):
+    """The expressions of a description, but for those of its parameters.
+
+    Attributes
+    ----------
+    places, nested
+        Where they are.
+    texts
+        Text and key, in words, of each.
+    """
+
+    places: tuple[Place, ...]
+    nested: Nested
+    texts: tuple[tuple[str, str], ...]
+
+
 def expressions(entries: Mapping[str, Any]) -> tuple[Place, ...]:
     """Where the tables of a description have expressions, but for those of its parameters."""
-    return _expressions(_Tables(entries))
+    return _expressions(_Tables(entries)).places
 
 
 @lru_cache(maxsize=4)
-def _expressions(tables: _Tables) -> tuple[Place, ...]:
-    """Where the tables have expressions, but for those of parameters."""
+def _expressions(tables: _Tables) -> _Expressions:
+    """The expressions of a description: variants have the same."""
     rest = {key: value for key, value in tables.entries.items() if key != PARAMETERS}
-    return tuple(_places(rest, ()))
+    found = dict(_places(rest, ()))
+    texts = []
+    for (first, *inner), text in found.items():
+        parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in inner)
+        texts.append((text, f"{first}{''.join(parts)}"))
+    return _Expressions(tuple(found), nested(found), tuple(texts))
 
 
-def _places(value: Any, place: Place) -> Iterator[Place]:
+def nested(places: Iterable[Place]) -> Nested:
+    """The numbers, from 0, of ``places``, for :func:`with_numbers`."""
+    out: Nested = {}
+    for number, place in enumerate(places):
+        inside: Any = out
+        for part in place[:-1]:
+            inside = inside.setdefault(part, {})
+        inside[place[-1]] = number
+    return out
+
+
+def with_numbers(tables: Any, changed: Nested, numbers: Sequence[float]) -> Any:
+    """Tables, checked or not, with ``numbers`` in the places of :func:`nested`; what has none of
+    these is not copied."""
+    parts = {
+        key: numbers[inner]
+        if isinstance(inner, int)
+        else with_numbers(
+            getattr(tables, key) if isinstance(tables, BaseModel) else tables[key],
+            inner,
+            numbers,
+        )
+        for key, inner in changed.items()
+    }
+    if isinstance(tables, BaseModel):
+        return tables.model_copy(update=parts)
+    out = copy(tables)
+    for key, value in parts.items():
+        out[key] = value
+    return out
+
+
+def _places(value: Any, place: Place) -> Iterator[tuple[Place, str]]:
+    """The places of expressions in a part of a description, and their texts."""
     if is_expression(value):
-        yield place
+        yield place, value
     elif isinstance(value, dict):
         for name, part in value.items():
             yield from _places(part, (*place, name))

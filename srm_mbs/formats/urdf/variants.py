@@ -6,9 +6,8 @@ Pinocchio's joints, or one of its inertias: the model is copied, and the file is
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
@@ -16,42 +15,59 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import share_scratch
+from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError
-from srm_mbs.formats.graph.joint_graph import inertia_at
+from srm_mbs.formats.graph.joint_graph import inertia_tensor
+from srm_mbs.formats.toml.parameters import Nested, with_numbers
 from srm_mbs.formats.toml.schema import OverrideEntry
 from srm_mbs.formats.urdf.override import TENSOR, changed_inertial, changed_place
 from srm_mbs.formats.urdf.validation import ElementChecker, doubtful_moments
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
-KEPT_BODIES = 1024
-"""Inertias that are kept: variants of a mechanism have most of them in common."""
 
-
-def plain_numbers(inertias: Sequence[pin.Inertia], places: Sequence[pin.SE3]) -> bool:
+def plain_numbers(inertias: Iterable[pin.Inertia], places: Iterable[pin.SE3]) -> bool:
     """Whether the numbers of a tree are those of real bodies, and of sensible size."""
+    bodies = list(inertias)
     numbers = [place.translation for place in places]
-    if inertias:
-        masses = np.array([inertia.mass for inertia in inertias])
-        tensors = np.array([inertia.inertia for inertia in inertias])
+    if bodies:
+        masses = np.array([inertia.mass for inertia in bodies])
+        tensors = np.array([inertia.inertia for inertia in bodies])
         if not (masses >= 0.0).all():
             return False
         negative, impossible = doubtful_moments(np.linalg.eigvalsh(tensors), masses)
         if negative.any() or impossible.any():
             return False
-        numbers += [masses, tensors.ravel(), *(inertia.lever for inertia in inertias)]
+        numbers += [masses, tensors.ravel(), *(inertia.lever for inertia in bodies)]
     return not numbers or bool(np.abs(np.concatenate(numbers)).max() <= LARGEST_MAGNITUDE)
 
 
-@lru_cache(maxsize=KEPT_BODIES)
-def inertia_as_read(mass: float, lever_numbers: bytes, tensor_numbers: bytes) -> pin.Inertia:
+def inertia_as_read(mass: float, lever: Sequence[float], tensor: FloatArray) -> pin.Inertia:
     """An inertia, about the centre of mass in the axes of the link, as Pinocchio's reader of URDF
-    rounds it; nothing may change it."""
-    lever, tensor = np.frombuffer(lever_numbers), np.frombuffer(tensor_numbers)
+    rounds it."""
     # The reader adds the body twice to one without mass.
     one = mass * (1.0 / (mass or 1.0))
-    body = pin.Inertia(mass, one * (one * (lever + 0.0)), np.zeros((3, 3)))
-    body.inertia = tensor.reshape((3, 3)) + 0.0
+    centre = np.array([one * (one * (x + 0.0)) for x in lever])
+    body = pin.Inertia(mass, centre, np.zeros((3, 3)))
+    body.inertia = tensor + 0.0
     return pin.SE3.Identity().act(body)
+
+
+def model_with(
+    known: pin.Model, places: Mapping[int, Sequence[float]], inertias: Mapping[int, pin.Inertia]
+) -> pin.Model:
+    """A copy of a model with other places (m) of joints in their parents and other inertias, by the
+    number of the joint."""
+    model = known.copy()
+    share_scratch(known, model)
+    placements, bodies = model.jointPlacements, model.inertias
+    for joint, place in places.items():
+        placements[joint].translation = np.array(place)
+    for joint, inertia in inertias.items():
+        bodies[joint] = inertia
+    return model
+
+
+UNTURNED = np.eye(3)
 
 
 class Inertial(NamedTuple):
@@ -73,10 +89,14 @@ class OverridableTree:
         Places (m) of the joints in their parents, by name.
     links
         Joint that carries each link, and its numbers, by name.
+    entries, numbers
+        The changes, and their numbers among those of variants.
     """
 
     joints: Mapping[str, list[float]]
     links: Mapping[str, tuple[str, Inertial]]
+    entries: Sequence[OverrideEntry]
+    numbers: Nested = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -118,37 +138,33 @@ class OverridableTree:
                     )
         except (InputError, KeyError):
             return None  # the changes say what is wrong
-        return cls(joints, links)
+        return cls(joints, links, entries)
 
-    def model(self, known: pin.Model, entries: Sequence[OverrideEntry]) -> pin.Model | None:
-        """The model with the changes of ``entries``, from that with others; None where the check of
-        the file would say something about them."""
-        places: dict[str, list[float]] = {}
-        inertias: dict[str, pin.Inertia] = {}
-        for entry in entries:
+    def with_numbers(self, numbers: Nested) -> OverridableTree:
+        """The same for variants with these numbers in their description."""
+        return replace(self, numbers=numbers.get("override", {}))
+
+    def model(self, known: pin.Model, numbers: Sequence[float]) -> pin.Model | None:
+        """The model with ``numbers`` at the places of the description, from that with others; None
+        where the check of the description or of the file would say something about them."""
+        places: dict[int, pin.SE3] = {}
+        inertias: dict[int, pin.Inertia] = {}
+        for entry in with_numbers(self.entries, self.numbers, numbers):
+            if not (entry.scale > 0.0 and entry.inertia_scale > 0.0):
+                return None
             if entry.joint:
-                places[entry.joint] = changed_place(
-                    self.joints[entry.joint], entry.scale, entry.xyz
-                )
+                place = changed_place(self.joints[entry.joint], entry.scale, entry.xyz)
+                places[known.getJointId(entry.joint)] = pin.SE3(UNTURNED, np.array(place) + 0.0)
             elif entry.link:
                 carrier, own = self.links[entry.link]
                 mass, (xx, xy, xz, yy, yz, zz) = changed_inertial(entry, own.mass, own.moments)
-                centre = pin.SE3(np.eye(3), np.array(changed_place(own.centre, 1.0, entry.xyz)))
-                inertias[carrier] = inertia_at(centre, mass, (xx, yy, zz, xy, xz, yz))
-        moved = [pin.SE3(np.eye(3), np.array(place)) for place in places.values()]
-        if not plain_numbers(list(inertias.values()), moved):
+                centre = changed_place(own.centre, 1.0, entry.xyz)
+                tensor = inertia_tensor((xx, yy, zz, xy, xz, yz))
+                inertias[known.getJointId(carrier)] = inertia_as_read(mass, centre, tensor)
+        if not plain_numbers(inertias.values(), places.values()):
             return None
-        model = known.copy()
-        share_scratch(known, model)
-        for name, place in places.items():
-            number = model.getJointId(name)
-            rotation = model.jointPlacements[number].rotation
-            model.jointPlacements[number] = pin.SE3(rotation, np.array(place) + 0.0)
-        for name, inertia in inertias.items():
-            model.inertias[model.getJointId(name)] = inertia_as_read(
-                inertia.mass, inertia.lever.tobytes(), inertia.inertia.tobytes()
-            )
-        return model
+        moved = {joint: place.translation for joint, place in places.items()}
+        return model_with(known, moved, inertias)
 
 
 def _link(joint: Element, tag: str) -> str:

@@ -22,7 +22,6 @@ The fields of :class:`LoopClosure` are the one list of the keys of a closure: de
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any
@@ -404,9 +403,9 @@ class LoopClosure:
         """The same closure between other places."""
         if self.type != "distance" or self.length is not None:
             _ = self.rows  # in the axes of the anchors, wherever these are: the copy has them, too
-        out = copy(self)
-        object.__setattr__(out, "a", a)
-        object.__setattr__(out, "b", b)
+        out = object.__new__(type(self))
+        for name, value in (vars(self) | {"a": a, "b": b}).items():
+            object.__setattr__(out, name, value)
         return out
 
     @property

@@ -46,9 +46,9 @@ def inertia_as_read(mass: float, lever: Sequence[float], tensor: FloatArray) -> 
     rounds it."""
     # The reader adds the body twice to one without mass.
     one = mass * (1.0 / (mass or 1.0))
-    centre = np.array([one * (one * (x + 0.0)) for x in lever])
-    body = pin.Inertia(mass, centre, np.zeros((3, 3)))
-    body.inertia = tensor + 0.0
+    body = pin.Inertia.Zero()
+    body.mass, body.inertia = mass, tensor + 0.0
+    body.lever = np.array([one * (one * (x + 0.0)) for x in lever])
     return pin.SE3.Identity().act(body)
 
 

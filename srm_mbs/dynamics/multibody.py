@@ -13,7 +13,7 @@ joint damping and friction, and force elements.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -238,6 +238,8 @@ class Mechanics(Manifold):
     sigma_scatters = False
     residual_scale = np.zeros(0)
     """Factor (m,) from each scaled row in use to row units."""
+    origins: Sequence[Sequence[float]] = ()
+    """Those of the anchors of the closures (:attr:`LoopKinematics.origins`)."""
 
     def __init__(self, mechanism: Mechanism, controller: Controller | None) -> None:
         super().__init__(mechanism)
@@ -307,6 +309,11 @@ class Mechanics(Manifold):
     def held(self) -> HeldForce | None:
         """The controller, if it is one whose output is held between samples."""
         return self._controller if isinstance(self._controller, HeldForce) else None
+
+    @property
+    def origins(self) -> Sequence[Sequence[float]]:
+        """Those of the anchors of the rows in use."""
+        return rows_in_use(self.mechanism).origins
 
     def count(self, evaluations: int, factorisations: int) -> None:
         """Add the work of the compiled kernel for this system to the counters."""
@@ -493,6 +500,7 @@ class Mechanics(Manifold):
             "gap_scale": self.residual_scale,
             "damping": self._damping if self.is_damped else None,
             "friction": self._friction if self.has_friction else None,
+            "friction_speed": float(self.friction_speed),
         }
 
     def constants_of_model(self) -> dict[str, Any]:
@@ -509,7 +517,6 @@ class Mechanics(Manifold):
             "order": [],
             "pivot_share": PIVOT_SHARE,
             "pivot_window": PIVOT_WINDOW,
-            "friction_speed": float(self.friction_speed),
             "forces": [] if self._forces is None else self._forces.constants(),
             "coincident": COINCIDENT,
             "half_turn": np.array([HALF_TURN_ROUNDING, LOCATED_HALF_TURN]),
@@ -665,6 +672,11 @@ class ClosedSystem(Mechanics):
             "order": list(self._order),
         }
         return super().constants_of_model() | rows.constants() | own
+
+    @property
+    def origins(self) -> Sequence[Sequence[float]]:
+        """Those of the anchors of the rows in use."""
+        return rows_in_use(self.mechanism).origins
 
     def count(self, evaluations: int, factorisations: int) -> None:
         """Add the work of the compiled kernel for this system to the counters."""

@@ -10,11 +10,11 @@ from functools import lru_cache
 from statistics import median
 
 import numpy as np
+import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, unscaled_rows
-from srm_mbs.dynamics.constraints.rows import Places
 from srm_mbs.dynamics.constraints.structure import (
     CLOSED,
     CLOSING_STEPS,
@@ -57,8 +57,8 @@ class ReusableAnalysis:
         Median of the last structural pivot.
     rows, in_use
         The rows of the closures, unscaled, and those that are kept, scaled.
-    loops
-        The closures.
+    loops, carriers
+        The closures, and the :meth:`~srm_mbs.model.anchors.Anchor.carrier` of each of their anchors.
     """
 
     structure: Structure
@@ -67,6 +67,7 @@ class ReusableAnalysis:
     rows: DrivenKinematics
     in_use: DrivenKinematics
     loops: tuple[LoopClosure, ...]
+    carriers: tuple[tuple[pin.SE3 | None, ...], ...]
 
     @classmethod
     def of(cls, mechanism: MechanismData) -> ReusableAnalysis | None:
@@ -77,43 +78,37 @@ class ReusableAnalysis:
             return None
         last_pivot = median(walked.last_pivots(structure.rank).tolist())
         rows, in_use = unscaled_rows(mechanism), rows_in_use(mechanism)
-        return cls(structure, walked.largest, last_pivot, rows, in_use, mechanism.loops)
+        model, loops = mechanism.model, mechanism.loops
+        carriers = tuple(tuple(end.carrier(model) for end in loop.anchors) for loop in loops)
+        return cls(structure, walked.largest, last_pivot, rows, in_use, loops, carriers)
 
     def lend_rows(self, mechanism: MechanismData) -> None:
-        """Give ``mechanism``, a variant whose tree has the same bodies and joints, the unscaled
-        rows with the places of its own closures, where these alone differ."""
-        if mechanism.drives:
-            return  # points that they move are anchors, too
+        """Give ``mechanism``, a variant whose tree has the same bodies, joints and frames, the
+        unscaled rows with the places of its own closures, where these alone differ."""
         loops = mechanism.loops
-        if not all(loop.anchors for loop in loops):
-            return  # couplings have no places
-        known = self._places_of(self.rows)
-        places = [known.get(id(loop)) or loop.resolve(mechanism.model) for loop in loops]
-        rows = self.rows.moved(loops, places)
+        if mechanism.drives or len(loops) != len(self.loops):
+            return  # points that drives move are anchors, too
+        if any(loop.rows is not own.rows for loop, own in zip(loops, self.loops)):
+            return
+        origins = [
+            known.origin_of(anchor, carrier)
+            for loop, own, carriers in zip(loops, self.loops, self.carriers)
+            for known, anchor, carrier in zip(own.anchors, loop.anchors, carriers)
+        ]
+        known = [origin for origin in origins if origin is not None]
+        rows = self.rows.moved(loops, known) if len(known) == len(origins) else None
         if rows is not None:
             unscaled_rows.keep(mechanism, rows)
             anchor_points.keep(mechanism, rows.anchors())
 
     def lend_rows_in_use(self, mechanism: MechanismData) -> None:
-        """The same with the rows in use, for a variant that has this analysis and those of
+        """The same with the rows in use, for a variant that has this analysis and the rows of
         :meth:`lend_rows`."""
         unscaled = unscaled_rows.kept(mechanism)
-        if unscaled is not None and not mechanism.drives:
-            known, loops = self._places_of(self.in_use), mechanism.loops
-            places = [known.get(id(loop), place) for loop, place in zip(loops, unscaled.places())]
-            rows = self.in_use.moved(loops, places)
+        if unscaled is not None and unscaled.idle is self.rows.idle:
+            rows = self.in_use.moved(mechanism.loops, unscaled.origins)
             if rows is not None:
                 rows_in_use.keep(mechanism, rows)
-
-    def _places_of(self, rows: DrivenKinematics) -> dict[int, Places]:
-        """The places of the closures in ``rows``, by their identity: variants that have the same
-        closures have them there."""
-        places = rows.places()
-        return (
-            {id(loop): place for loop, place in zip(self.loops, places)}
-            if len(places) == len(self.loops)
-            else {}
-        )
 
     def for_variant(self, mechanism: MechanismData) -> Structure | None:
         """The analysis in the units of ``mechanism``, a variant; None where it is not valid.

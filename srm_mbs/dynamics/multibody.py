@@ -238,8 +238,6 @@ class Mechanics(Manifold):
     sigma_scatters = False
     residual_scale = np.zeros(0)
     """Factor (m,) from each scaled row in use to row units."""
-    origins: Sequence[Sequence[float]] = ()
-    """Those of the anchors of the closures (:attr:`LoopKinematics.origins`)."""
 
     def __init__(self, mechanism: Mechanism, controller: Controller | None) -> None:
         super().__init__(mechanism)
@@ -279,6 +277,11 @@ class Mechanics(Manifold):
         return np.zeros(self.nq), self._no_force
 
     @property
+    def origins(self) -> Sequence[Sequence[float]]:
+        """Those of the anchors of the closures in use, each in the axes of its joint."""
+        return ()
+
+    @property
     def controlled(self) -> bool:
         """Whether a controller acts."""
         return self._controller is not None
@@ -309,11 +312,6 @@ class Mechanics(Manifold):
     def held(self) -> HeldForce | None:
         """The controller, if it is one whose output is held between samples."""
         return self._controller if isinstance(self._controller, HeldForce) else None
-
-    @property
-    def origins(self) -> Sequence[Sequence[float]]:
-        """Those of the anchors of the rows in use."""
-        return rows_in_use(self.mechanism).origins
 
     def count(self, evaluations: int, factorisations: int) -> None:
         """Add the work of the compiled kernel for this system to the counters."""

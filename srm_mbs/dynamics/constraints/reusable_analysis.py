@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import compress
 from statistics import median
 
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, unscaled_rows
 from srm_mbs.dynamics.constraints.structure import (
@@ -23,7 +23,6 @@ from srm_mbs.dynamics.constraints.structure import (
     ZERO_ROW,
     ManifoldSampler,
     RandomSteps,
-    Samples,
     Structure,
     random_steps,
     row_names,
@@ -51,18 +50,18 @@ class ReusableAnalysis:
     ----------
     structure
         The analysis.
-    lengths : (rows,)
+    lengths
         Largest norm of each row, over its scale, on the walk.
     last_pivot
         Median of the last structural pivot.
     rows, in_use
         The rows of the closures, unscaled, and those that are kept, scaled.
     loops, carriers
-        The closures, and the :meth:`~srm_mbs.model.anchors.Anchor.carrier` of each of their anchors.
+        The closures, and the :meth:`~srm_mbs.model.anchors.Anchor.carrier` of each anchor.
     """
 
     structure: Structure
-    lengths: FloatArray
+    lengths: list[float]
     last_pivot: float
     rows: DrivenKinematics
     in_use: DrivenKinematics
@@ -76,11 +75,10 @@ class ReusableAnalysis:
         walked = None if structure.notes else _walked(structure, mechanism)
         if walked is None:
             return None
-        last_pivot = median(walked.last_pivots(structure.rank).tolist())
         rows, in_use = unscaled_rows(mechanism), rows_in_use(mechanism)
         model, loops = mechanism.model, mechanism.loops
         carriers = tuple(tuple(end.carrier(model) for end in loop.anchors) for loop in loops)
-        return cls(structure, walked.largest, last_pivot, rows, in_use, loops, carriers)
+        return cls(structure, *walked, rows, in_use, loops, carriers)
 
     def lend_rows(self, mechanism: MechanismData) -> None:
         """Give ``mechanism``, a variant whose tree has the same bodies, joints and frames, the
@@ -130,11 +128,11 @@ class ReusableAnalysis:
         walked = _walked(structure, mechanism)
         if walked is None:
             return None
-        used = structure.kept
-        ratios = walked.largest[used] / self.lengths[used]
-        pivot = median(walked.last_pivots(structure.rank).tolist())
-        ratios = np.append(ratios, pivot / self.last_pivot)
-        if not (ratios.min() > 1.0 / SIMILAR and ratios.max() < SIMILAR):
+        lengths, pivot = walked
+        used = structure.kept.tolist()
+        ratios = [a / b for a, b, own in zip(lengths, self.lengths, used) if own]
+        ratios.append(pivot / self.last_pivot)
+        if not (min(ratios) > 1.0 / SIMILAR and max(ratios) < SIMILAR):
             return None
         return structure.at(mechanism)
 
@@ -148,9 +146,10 @@ def _steps(nv: int) -> RandomSteps:
     return steps
 
 
-def _walked(structure: Structure, mechanism: MechanismData) -> Samples | None:
+def _walked(structure: Structure, mechanism: MechanismData) -> tuple[list[float], float] | None:
     """A walk of ``CHECKED_STEPS`` from the start of ``mechanism``, with the row scales of
-    ``structure``; None if it contradicts the ranks and zero rows of that, or finds nothing."""
+    ``structure``: the largest norm of each row, and the median of the last structural pivot; None
+    if it contradicts the ranks and zero rows of that, or finds nothing."""
     rank = structure.rank
     sampler = ManifoldSampler(mechanism, coordinate_units(mechanism, mechanism.q0, mechanism.v0))
     sampler.scale, sampler.eliminations = structure.row_scale, structure.eliminations
@@ -160,15 +159,21 @@ def _walked(structure: Structure, mechanism: MechanismData) -> Samples | None:
     walk = [_steps(int(mechanism.model.nv))]
     samples = sampler.explore_along(start, walk, mechanism.v0, sample_start=True)
     sampler.end()
-    loops = int((samples.of_loops > STRUCTURAL_PIVOT).sum(axis=1).max())
-    if int(samples.ranks().max()) != rank or loops != structure.loop_rank:
+    # Lists, because there are few numbers: a reduction of NumPy takes as long as all this.
+    pivots, largest = samples.pivots.tolist(), samples.largest.tolist()
+    ranks = _ranks(pivots)
+    if max(ranks) != rank or max(_ranks(samples.of_loops.tolist())) != structure.loop_rank:
         return None
-    in_use = samples.largest > ZERO_ROW
-    in_use[sampler.closed :] = True
-    if not np.array_equal(in_use, structure.kept) or not samples.largest[in_use].all():
+    in_use = [row >= sampler.closed or size > ZERO_ROW for row, size in enumerate(largest)]
+    if in_use != structure.kept.tolist() or not all(compress(largest, in_use)):
         return None
-    if rank < samples.pivots.shape[1]:
-        redundant = max(float(samples.pivots[:, rank:].max()), PIVOT_ZERO)
-        if float(samples.last_pivots(rank).min()) < RANK_GAP * redundant:
-            return None
-    return samples
+    last = [own[rank - 1] for own, found in zip(pivots, ranks) if found == rank]
+    redundant = max((pivot for own in pivots for pivot in own[rank:]), default=0.0)
+    if rank < len(pivots[0]) and min(last) < RANK_GAP * max(redundant, PIVOT_ZERO):
+        return None
+    return largest, median(last)
+
+
+def _ranks(pivots: list[list[float]]) -> list[int]:
+    """The number of independent rows in each of several configurations."""
+    return [sum(pivot > STRUCTURAL_PIVOT for pivot in own) for own in pivots]

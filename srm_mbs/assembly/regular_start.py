@@ -38,7 +38,10 @@ from srm_mbs.dynamics.constraints.row_algebra import SPARSE_ABOVE
 from srm_mbs.dynamics.constraints.structure import ROUNDING_ROW
 from srm_mbs.dynamics.scaling import RELATIVE_ROUNDING, keep_units, rotating_coordinates
 from srm_mbs.model.coordinates import free_coordinates
-from srm_mbs.model.mechanism import MechanismData
+from srm_mbs.model.mechanism import MechanismData, per_tree
+
+KEPT_FREE = 16
+"""Sets of held joints whose free coordinates are kept: variants hold the same."""
 
 
 @cache
@@ -59,6 +62,21 @@ def _rules() -> Any:
         largest_rate_error=LARGEST_RATE_ERROR,
         size_rounding=RELATIVE_ROUNDING,
     )
+
+
+@per_tree
+def _free_coordinates(mechanism: MechanismData) -> dict[tuple[str, ...], list[int]]:
+    """Velocity indices of the joints that are not held, by those that are."""
+    return {}
+
+
+def _free(mechanism: MechanismData, held: tuple[str, ...]) -> list[int]:
+    known = _free_coordinates(mechanism)
+    if held not in known:
+        if len(known) >= KEPT_FREE:
+            known.clear()
+        known[held] = free_coordinates(mechanism, held).tolist()
+    return known[held]
 
 
 def regular_start(
@@ -92,8 +110,8 @@ def regular_start(
         _rules(),
         start,
         rates,
-        free_coordinates(mechanism, held),
-        free_coordinates(mechanism, held_rates),
+        _free(mechanism, held),
+        _free(mechanism, held_rates),
         rotating_coordinates(mechanism),
         open_spreads(int(mechanism.model.nv)),
     )

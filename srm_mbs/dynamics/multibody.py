@@ -13,7 +13,7 @@ joint damping and friction, and force elements.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -277,6 +277,11 @@ class Mechanics(Manifold):
         return np.zeros(self.nq), self._no_force
 
     @property
+    def origins(self) -> Sequence[Sequence[float]]:
+        """Those of the anchors of the closures in use, each in the axes of its joint."""
+        return ()
+
+    @property
     def controlled(self) -> bool:
         """Whether a controller acts."""
         return self._controller is not None
@@ -493,6 +498,7 @@ class Mechanics(Manifold):
             "gap_scale": self.residual_scale,
             "damping": self._damping if self.is_damped else None,
             "friction": self._friction if self.has_friction else None,
+            "friction_speed": float(self.friction_speed),
         }
 
     def constants_of_model(self) -> dict[str, Any]:
@@ -509,7 +515,6 @@ class Mechanics(Manifold):
             "order": [],
             "pivot_share": PIVOT_SHARE,
             "pivot_window": PIVOT_WINDOW,
-            "friction_speed": float(self.friction_speed),
             "forces": [] if self._forces is None else self._forces.constants(),
             "coincident": COINCIDENT,
             "half_turn": np.array([HALF_TURN_ROUNDING, LOCATED_HALF_TURN]),
@@ -665,6 +670,11 @@ class ClosedSystem(Mechanics):
             "order": list(self._order),
         }
         return super().constants_of_model() | rows.constants() | own
+
+    @property
+    def origins(self) -> Sequence[Sequence[float]]:
+        """Those of the anchors of the rows in use."""
+        return rows_in_use(self.mechanism).origins
 
     def count(self, evaluations: int, factorisations: int) -> None:
         """Add the work of the compiled kernel for this system to the counters."""

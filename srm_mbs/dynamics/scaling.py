@@ -6,8 +6,10 @@ other masses or on another time scale, takes the same steps.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import islice
 from typing import NamedTuple
 
@@ -188,7 +190,7 @@ def _known_units(mechanism: MechanismData) -> dict[tuple[bytes, bytes], Units]:
 def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> Units:
     """Units of ``mechanism`` at the configuration q (nq,) and velocity v (nv,)."""
     gravity = mechanism.model.gravity.linear
-    if not gravity.any():
+    if not any(gravity.tolist()):
         return _units_at(mechanism, q, v)
     known, key = _known_units(mechanism), (gravity.tobytes(), q.tobytes())
     if key not in known:
@@ -199,14 +201,15 @@ def coordinate_units(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> 
 def keep_units(mechanism: MechanismData, q: FloatArray, diagonal: float) -> None:
     """Take the units at q (nq,) from now on from the ``diagonal`` (m) of the scene there, which the
     kernel computed; they are asked for again where they depend on rates."""
-    gravity = mechanism.model.gravity.linear
-    if not gravity.any():
+    gravity = mechanism.model.gravity.linear.tobytes()
+    size = _norm(gravity)
+    if size == 0.0:
         return
     length = diagonal or 1.0
     coordinate = np.full(mechanism.model.nv, length)
     coordinate[rotating_coordinates(mechanism)] = 1.0
-    units = Units(length, coordinate, _rate_by_gravity(mechanism.model, length))
-    _keep_units(mechanism, (gravity.tobytes(), q.tobytes()), units)
+    units = Units(length, coordinate, math.sqrt(size / length))
+    _keep_units(mechanism, (gravity, q.tobytes()), units)
 
 
 def _keep_units(mechanism: MechanismData, key: tuple[bytes, bytes], units: Units) -> None:
@@ -216,8 +219,10 @@ def _keep_units(mechanism: MechanismData, key: tuple[bytes, bytes], units: Units
     known[key] = units
 
 
-def _rate_by_gravity(model: pin.Model, length: float) -> float:
-    return float(np.sqrt(np.linalg.norm(model.gravity.linear) / length))
+@lru_cache(maxsize=KEPT_UNITS)
+def _norm(vector: bytes) -> float:
+    """Norm of a vector, from its bytes: variants have the same gravity."""
+    return float(np.linalg.norm(np.frombuffer(vector)))
 
 
 def _units_at(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> Units:
@@ -226,7 +231,7 @@ def _units_at(mechanism: MechanismData, q: FloatArray, v: FloatArray) -> Units:
     pin.computeJointJacobians(model, data, q)
     length = _diagonal(mechanism, data) or 1.0
     coordinate = np.where(_angle_components(data), 1.0, length)
-    rate = _rate_by_gravity(model, length)
+    rate = math.sqrt(_norm(model.gravity.linear.tobytes()) / length)
     if rate == 0.0:
         rates = np.abs(v) / coordinate
         if not rates.any() and mechanism.forces:

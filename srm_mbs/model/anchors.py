@@ -12,7 +12,7 @@ import pinocchio as pin
 from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.model.numbers import vector
 
-_UNTURNED = np.eye(3)
+_UNTURNED, _IDENTITY = np.eye(3), np.eye(4)
 WORLD = "world"
 """Reserved link name: the fixed ground."""
 
@@ -82,6 +82,22 @@ class Anchor:
             return 0, offset
         frame = self._frame(model)
         return int(frame.parentJoint), frame.placement * offset
+
+    def carrier(self, model: pin.Model) -> pin.SE3 | None:
+        """Placement of its link or frame in the joint; None where that is the identity."""
+        if self.link == WORLD:
+            return None
+        placement = self._frame(model).placement
+        return None if np.array_equal(placement.homogeneous, _IDENTITY) else placement
+
+    def origin_of(self, other: Anchor, carrier: pin.SE3 | None) -> list[float] | None:
+        """Origin (3,) of ``other`` in the axes of the joint, as :meth:`resolve` has it, if it is on
+        the same link or frame, with this :meth:`carrier`, and has the same axes; None otherwise."""
+        if other.link != self.link or other.frame != self.frame or other.rpy != self.rpy:
+            return None
+        if carrier is None:
+            return [x + 0.0 for x in other.xyz]  # no zero has a sign
+        return (carrier * pin.SE3(_UNTURNED, np.array(other.xyz))).translation.tolist()  # type: ignore[no-any-return]
 
     def joint(self, model: pin.Model) -> int:
         """The joint of :meth:`resolve`, which raises the same, without the placement."""

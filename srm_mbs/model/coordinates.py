@@ -9,10 +9,11 @@ planar joint; rates are linear then angular, in the moving body's frame.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.errors import InputError, safe_repr
@@ -73,6 +74,17 @@ def write_position(joint: Any, q: FloatArray, name: str, value: Any) -> None:
             )
         array[part] /= length
     q[own] = array
+
+
+def write_positions(model: pin.Model, q: FloatArray, values: Mapping[str, Any]) -> None:
+    """:func:`write_position` of all ``values``, joint -> position, of joints of ``model``."""
+    sizes, places = model.nqs, model.idx_qs
+    for name, value in values.items():
+        number = model.getJointId(name)
+        if type(value) is float and sizes[number] == 1 and math.isfinite(value):
+            q[places[number]] = value  # a joint model costs more than the rest
+        else:
+            write_position(model.joints[number], q, name, value)
 
 
 def set_rate(mechanism: MechanismData, v: FloatArray, name: str, value: Any) -> None:

@@ -169,7 +169,7 @@ def sweep(
         finished = stack.enter_context(closing(_finished(task, missing, executor, chunk)))
         for case, outcome in finished:
             outcomes[case.index] = outcome
-            log.debug("%s: %s", case.where, outcome.message)
+            log.debug("cases[%r]: %s", case.name, outcome.message)
             if journal is not None:
                 journal.add(case, outcome)
             if report is not None:

@@ -11,6 +11,7 @@
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
@@ -670,9 +671,15 @@ struct PySystem {
         system->hold(t, vector_of(force, system->nv, "force"), keep);
     }
 
-    void renew(nb::handle unit, nb::handle gap_scale, nb::handle damping, nb::handle friction) {
+    void move(nb::object to, const std::vector<Point>& origins) {
+        system->move(pinocchio_model_in(to), origins);
+        model = std::move(to);
+    }
+
+    void renew(nb::handle unit, nb::handle gap_scale, nb::handle damping, nb::handle friction,
+               double friction_speed) {
         system->renew(optional_vector(unit), optional_vector(gap_scale), optional_vector(damping),
-                      optional_vector(friction));
+                      optional_vector(friction), friction_speed);
     }
 };
 
@@ -742,8 +749,9 @@ void bind_system(nb::module_& m) {
         .def("states_ahead", &PySystem::states_ahead)
         .def("hold", &PySystem::hold)
         .def("use_code", &PySystem::use_code, nb::arg("code").none())
+        .def("move", &PySystem::move, nb::arg("model"), nb::arg("origins"))
         .def("renew", &PySystem::renew, nb::arg("unit"), nb::arg("gap_scale"),
-             nb::arg("damping").none(), nb::arg("friction").none())
+             nb::arg("damping").none(), nb::arg("friction").none(), nb::arg("friction_speed"))
         .def("restart", [](PySystem& s) { s.system->restart(); })
         .def_prop_ro("sparse", [](const PySystem& s) { return s.system->sparse(); })
         .def_prop_ro("evaluations", [](const PySystem& s) { return s.system->evaluations; })

@@ -52,7 +52,7 @@ void wrench_on_b(const ClosureRows& closure, const pinocchio::Data& data, const 
 
 }  // namespace
 
-int System::joint_count() const { return work_->model.njoints; }
+int System::joint_count() const { return work_->model->njoints; }
 
 // The least-norm solution of W lam = L^T yhat, W = L^-1 G^T with the rows scaled, down to the rank of
 // the stage: with W Pi = Q R and R^T = Z S, lam = Pi Z S^-T Q^T L^T yhat.
@@ -103,7 +103,7 @@ void System::reactions(double t, const double* state, System& all, const double*
                        const std::vector<int>& kept, double* multipliers, double* on_b,
                        double* joints) {
     auto& w = *work_;
-    const int rows = all.data_.rows, count = w.model.njoints;
+    const int rows = all.data_.rows, count = w.model->njoints;
     std::vector<double> rate(2 * nv), generalised(nv);
     this->rate(rate.data());
     std::fill(multipliers, multipliers + rows, 0.0);
@@ -121,7 +121,7 @@ void System::reactions(double t, const double* state, System& all, const double*
     std::copy(q, q + nq, w.q.data());
     std::copy(v, v + nv, w.v.data());
     std::copy(rate.begin() + nv, rate.end(), w.tau.data());
-    pinocchio::rnea(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
+    pinocchio::rnea(*w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
     for (int j = 0; j < count; ++j) {
         const auto& force = w.data.f[j].toVector();
         std::copy(force.data(), force.data() + 6, joints + 6 * j);
@@ -130,7 +130,7 @@ void System::reactions(double t, const double* state, System& all, const double*
     std::vector<double> loads(6 * static_cast<std::size_t>(count), 0.0);
     if (on_several_) {
         std::vector<BushingStep> none;
-        pinocchio::computeJointJacobians(w.model, w.data);
+        pinocchio::computeJointJacobians(*w.model, w.data);
         add_forces(data_.forces, data_.coincident, w, t, q, v, none, generalised.data(), nullptr,
                    loads.data());
     }
@@ -147,7 +147,7 @@ void System::reactions(double t, const double* state, System& all, const double*
         on_b += 6;
     }
     for (int j = count - 1; j > 0; --j)
-        for (int i = 0; i < 6; ++i) loads[6 * w.model.parents[j] + i] += loads[6 * j + i];
+        for (int i = 0; i < 6; ++i) loads[6 * w.model->parents[j] + i] += loads[6 * j + i];
     for (int j = 0; j < count; ++j) {
         double* const out = joints + 6 * j;
         const double* const carried = &loads[6 * j];

@@ -15,7 +15,7 @@ namespace srm {
 
 // Bounding box of joints, centres of mass and anchors: _diagonal() of dynamics/scaling.py.
 double System::scene_diagonal(double rounding) const {
-    const auto& model = work_->model;
+    const auto& model = *work_->model;
     const auto& places = work_->data.oMi;
     Eigen::Array3d least = Eigen::Array3d::Constant(std::numeric_limits<double>::infinity());
     Eigen::Array3d most = -least;

@@ -219,16 +219,16 @@ System::System(const void* model, SystemData data, Controller controller)
       controller_(std::move(controller)),
       work_(std::make_unique<pinocchio_model::Workspace>(
           checked_model(*static_cast<const pinocchio::Model*>(model)))) {
-    check_indices(data_, work_->model);
-    nq = work_->model.nq;
-    nv = work_->model.nv;
+    check_indices(data_, *work_->model);
+    nq = work_->model->nq;
+    nv = work_->model->nv;
     closed_ = data_.structural_rank > 0;
     flat_ = nq == nv;
     on_several_ = std::any_of(data_.forces.begin(), data_.forces.end(), acts_on_several);
     if (closed_)
         projection_ = make_projection(data_.structural_rank, data_.sigma_ref, pattern(),
                                       // A joint that mimics another adds entries off the tree.
-                                      work_->model.mimicking_joints.empty() ? data_.algebra
+                                      work_->model->mimicking_joints.empty() ? data_.algebra
                                                                             : "dense");
     else
         G_.resize(static_cast<std::size_t>(data_.rows) * nv);
@@ -451,8 +451,22 @@ void System::hold(double t, const double* force, bool keep) {
     held_.insert(held_.end(), force, force + nv);
 }
 
+void System::move(const void* model, const std::vector<Point>& origins) {
+    const auto& other = checked_model(*static_cast<const pinocchio::Model*>(model));
+    if (other.njoints != work_->model->njoints || other.nq != nq || other.nv != nv)
+        throw std::invalid_argument("model has other joints");
+    expect_size("origins", origins.size(), 2 * data_.closures.size());
+    work_->model = &other;
+    auto next = origins.begin();
+    for (ClosureRows& closure : data_.closures) {
+        closure.at_a = *next++;
+        closure.at_b = *next++;
+    }
+}
+
 void System::renew(std::vector<double> unit, std::vector<double> residual_scale,
-                   std::vector<double> damping, std::vector<double> friction) {
+                   std::vector<double> damping, std::vector<double> friction,
+                   double friction_speed) {
     const auto components = static_cast<std::size_t>(nv);
     expect_size("unit", unit.size(), components);
     expect_size("residual_scale", residual_scale.size(), static_cast<std::size_t>(data_.rows));
@@ -462,6 +476,7 @@ void System::renew(std::vector<double> unit, std::vector<double> residual_scale,
     data_.residual_scale = std::move(residual_scale);
     data_.damping = std::move(damping);
     data_.friction = std::move(friction);
+    data_.friction_speed = friction_speed;
     find_friction();
     restart();
 }
@@ -544,10 +559,10 @@ void System::law_accelerations(double* out) {
     };
     if (code_) {  // it computes the kinematics of bushings only
         pinocchio_model::move_bodies(w);
-        pinocchio::computeJointJacobians(w.model, w.data);
+        pinocchio::computeJointJacobians(*w.model, w.data);
     }
     if (!closed_ && nv > one_pass_size) {
-        pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
+        pinocchio::crba(*w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
         factorise_mass();
     }
     if (joined_.empty()) forces_with(none);
@@ -744,7 +759,7 @@ void System::tree_terms(const double* state) {
     else if (closed_)
         pinocchio_model::compute_terms(w);
     else
-        pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
+        pinocchio::aba(*w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
 }
 
 // The velocities, and the forces along coordinates but those of elements.
@@ -773,7 +788,7 @@ void System::applied_forces(double t, const double* state, double* out) {
     if (!data_.forces.empty()) {
         if (on_several_) {
             move_bodies(state);
-            pinocchio::computeJointJacobians(w.model, w.data);
+            pinocchio::computeJointJacobians(*w.model, w.data);
         }
         add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
                    tracks_laws_ ? &laws_ : nullptr);
@@ -790,7 +805,7 @@ bool System::derivatives(const double* state, const double* a, double* by_forces
     const auto powers = [](const JointRow& row) { return !row.powers.empty(); };
     if (!data_.closures.empty() || !joined_.empty() || rank_deficient()) return false;
     if (std::any_of(data_.joint_rows.begin(), data_.joint_rows.end(), powers)) return false;
-    if (!w.model.mimicking_joints.empty() || !w.model.gravity.angular().isZero(0.0)) return false;
+    if (!w.model->mimicking_joints.empty() || !w.model->gravity.angular().isZero(0.0)) return false;
     Matrix M = Matrix::Zero(nv, nv), dq(M), dv(M), N;
     if (closed_) {
         N.resize(nv, rank());
@@ -799,7 +814,7 @@ bool System::derivatives(const double* state, const double* a, double* by_forces
     std::copy(state, state + nq, w.q.data());
     std::copy(state + nq, state + nq + nv, w.v.data());
     std::copy(a, a + nv, w.tau.data());
-    pinocchio::computeRNEADerivatives(w.model, w.data, Argument(w.q), Argument(w.v),
+    pinocchio::computeRNEADerivatives(*w.model, w.data, Argument(w.q), Argument(w.v),
                                       Argument(w.tau), Eigen::Ref<Matrix>(dq),
                                       Eigen::Ref<Matrix>(dv), Eigen::Ref<Matrix>(M));
     const Eigen::LLT<Matrix, Eigen::Upper> factors(M);
@@ -872,7 +887,7 @@ bool System::linearise(double t, const double* state, const double* a,
         white_ = projection_->white_multiplier;
         projection_->multiplier(white_.data(), multipliers_.data());
     } else if (nv > one_pass_size) {
-        pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
+        pinocchio::crba(*w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
         factorise_mass();
     }
     bushing_turns(data_.forces, w, bushings_, turns_.data());
@@ -986,12 +1001,12 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     if (!closed_) {
         if (!data_.forces.empty()) {
             pinocchio_model::move_bodies(w);
-            pinocchio::computeJointJacobians(w.model, w.data);
+            pinocchio::computeJointJacobians(*w.model, w.data);
             add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
                        laws);
         }
         std::copy(f_.begin(), f_.end(), w.tau.data());
-        pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
+        pinocchio::aba(*w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
         std::copy(w.data.ddq.data(), w.data.ddq.data() + nv, rate_.begin());
         if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
         return;
@@ -1187,7 +1202,7 @@ void System::retract(const double* state, const double* delta, double* out) {
         auto& w = *work_;
         std::copy(state, state + nq, w.q.data());
         std::copy(delta, delta + nv, w.v.data());
-        pinocchio::integrate(w.model, w.q, w.v, w.q2);
+        pinocchio::integrate(*w.model, w.q, w.v, w.q2);
         for (const GroupJoint& joint : data_.groups)
             if (joint.group == Group::se2)
                 planar_translation(state + joint.position, delta + joint.start,
@@ -1258,12 +1273,12 @@ void System::difference(const double* start, const double* end, const double* ne
     Eigen::VectorXd from = Eigen::Map<const Eigen::VectorXd>(start, nq);
     const Eigen::VectorXd to = Eigen::Map<const Eigen::VectorXd>(end, nq);
     Eigen::VectorXd step(nv);
-    pinocchio::difference(w.model, from, to, step);
+    pinocchio::difference(*w.model, from, to, step);
     std::copy(step.data(), step.data() + nv, out);
     std::vector<double> moved(nq + nv);
     retract(start, out, moved.data());
     from = Eigen::Map<const Eigen::VectorXd>(moved.data(), nq);
-    pinocchio::difference(w.model, from, to, step);
+    pinocchio::difference(*w.model, from, to, step);
     for (int i = 0; i < nv; ++i) out[i] += step[i];
     constexpr double turn = 2.0 * EIGEN_PI;
     for (int i : data_.wrapped_angles) out[i] += turn * std::nearbyint((near[i] - out[i]) / turn);
@@ -1404,7 +1419,7 @@ double System::closure_residual_at(double t, const double* state) {
     if (!closed_) return 0.0;
     auto& w = *work_;
     std::copy(state, state + nq, w.q.data());
-    pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
+    pinocchio::crba(*w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
     update_closures(state, false);
     update_drives(t, false);
     return closure_residual();
@@ -1422,7 +1437,7 @@ void System::working_forces(double* all, double* working) {
     auto& w = *work_;
     std::copy(f_.begin(), f_.end(), all);
     for (int i = 0; i < nv; ++i) working[i] = f_[i] + w.data.nle[i];
-    pinocchio::computeGeneralizedGravity(w.model, w.data, Argument(w.q));
+    pinocchio::computeGeneralizedGravity(*w.model, w.data, Argument(w.q));
     for (int i = 0; i < nv; ++i) working[i] -= w.data.g[i];
 }
 
@@ -1498,12 +1513,12 @@ std::array<double, 2> System::energies(const double* state, bool there) {
     auto& w = *work_;
     if (!there) move_bodies(state);
     double kinetic = 0.0, potential = potential_energy(data_.forces, w, state);
-    for (int i = 1; i < w.model.njoints; ++i) {
-        const auto& body = w.model.inertias[i];
+    for (int i = 1; i < w.model->njoints; ++i) {
+        const auto& body = w.model->inertias[i];
         kinetic += 0.5 * body.vtiv(w.data.v[i]);
-        potential -= body.mass() * w.model.gravity.linear().dot(w.data.oMi[i].act(body.lever()));
+        potential -= body.mass() * w.model->gravity.linear().dot(w.data.oMi[i].act(body.lever()));
     }
-    for (int i = 0; i < nv; ++i) kinetic += 0.5 * w.model.armature[i] * w.v[i] * w.v[i];
+    for (int i = 0; i < nv; ++i) kinetic += 0.5 * w.model->armature[i] * w.v[i] * w.v[i];
     return {kinetic, potential};
 }
 
@@ -1517,7 +1532,7 @@ void System::write_rows(double t, const double* q, double* G, int width) {
     auto& w = *work_;
     t = std::min(std::max(t, first_), last_);
     std::copy(q, q + nq, w.q.data());
-    pinocchio::computeJointJacobians(w.model, w.data, Argument(w.q));
+    pinocchio::computeJointJacobians(*w.model, w.data, Argument(w.q));
     update_closures(q, false);
     update_drives(t, false);
     const auto copy = [&](int row, int j) { G[row * width + j] = filled(row)[j]; };

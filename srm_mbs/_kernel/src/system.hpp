@@ -194,9 +194,12 @@ public:
     // From t on a constant force (nv,) acts in addition to all others.  With `keep` the forces held
     // before still act at earlier times.
     void hold(double t, const double* force, bool keep);
+    // Takes the numbers of another model with the same bodies and joints, and the origins of the
+    // anchors a and b of each closure in the axes of their joints.
+    void move(const void* model, const std::vector<Point>& origins);
     // Resets the system for a run from another start, on which these values depend.
     void renew(std::vector<double> unit, std::vector<double> residual_scale,
-               std::vector<double> damping, std::vector<double> friction);
+               std::vector<double> damping, std::vector<double> friction, double friction_speed);
     // Resets the system for another run from a start that these do not depend on.
     void restart();
     // Whether `force` (nv,) is the force held last.

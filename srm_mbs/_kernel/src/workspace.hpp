@@ -14,11 +14,11 @@ using Argument = Eigen::Ref<const Eigen::VectorXd>;
 
 struct Workspace {
     explicit Workspace(const pinocchio::Model& model)
-        : model(model), q(model.nq), q2(model.nq), v(model.nv), tau(model.nv),
+        : model(&model), q(model.nq), q2(model.nq), v(model.nv), tau(model.nv),
           one_pass(has_usual_joints(model)) {
         prepare(data, model);
     }
-    const pinocchio::Model& model;
+    const pinocchio::Model* model;
     pinocchio::Data data;
     Eigen::VectorXd q, q2, v, tau;
     const bool one_pass;

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel import core
-from srm_mbs._kernel.workspace import LARGE, workspace
+from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rheonomic import unscaled_rows
 from srm_mbs.dynamics.constraints.row_algebra import CompiledAlgebra, RowAlgebra
@@ -24,9 +23,6 @@ _NO_NUMBERS = np.zeros(0)
 KEPT_SUPPORTS = 2048
 """Closures whose coordinates are kept: variants of a mechanism have the same.  Runs ask for all in
 turn: of a mechanism with more closures none would still be there."""
-
-KEPT_SYSTEMS = 4
-"""Kernel systems of one mechanism that wait for users, at most; of a large mechanism one."""
 
 
 def closure_structs(constants: dict[str, Any]) -> dict[str, Any]:
@@ -84,10 +80,11 @@ class ClosureRows:
     def __init__(self, model: pin.Model, rows: LoopKinematics) -> None:
         self._model, self._given = model, rows
         self.g, self.G = rows.g, rows.G
-        self.idle: deque[Any] | None = None
-        if core is None:
-            return
-        count, nv = len(rows.g), int(model.nv)
+        self.idle = None if core is None else rows.idle
+
+    def _made(self) -> Any:
+        """A kernel system of the rows."""
+        count, nv = len(self._given.g), int(self._model.nv)
         fields: dict[str, Any] = {
             "drives": [],
             "forces": [],
@@ -113,26 +110,26 @@ class ClosureRows:
             "farthest_node": 0.0,
             "rotation_per_step": 0.0,
         }
-        self._fields = core.SystemData(**fields, **closure_structs(LoopKinematics.constants(rows)))
-        kernel_system = core.System(model, self._fields, None)
-        self.idle = deque((kernel_system,), maxlen=1 if nv > LARGE else KEPT_SYSTEMS)
+        closures = closure_structs(LoopKinematics.constants(self._given))
+        made: Any = core
+        return made.System(self._model, made.SystemData(**fields, **closures), None)
 
     def _by_kernel(self, name: str, *arguments: Any) -> Any:
         """The result of a method of the kernel's system of the rows, which no other thread uses
         meanwhile; None without the kernel, and where something cannot be evaluated."""
-        idle = self.idle
-        if idle is None:
+        if self.idle is None:
             return None
         try:
-            kernel_system = idle.pop()  # two threads never get the same
+            kernel_system = self.idle.pop()  # two threads never get the same
+            kernel_system.move(self._model, self._given.origins)
         except IndexError:
-            kernel_system = core.System(self._model, self._fields, None)  # type: ignore[union-attr]
+            kernel_system = self._made()
         try:
             return getattr(kernel_system, name)(*arguments)
         except ArithmeticError:
             return None
         finally:
-            idle.append(kernel_system)
+            self.idle.append(kernel_system)
 
     @cached_property
     def _data(self) -> pin.Data:

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import compress
 from statistics import median
 
 import numpy as np
+import pinocchio as pin
 
-from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics, unscaled_rows
-from srm_mbs.dynamics.constraints.rows import Places
 from srm_mbs.dynamics.constraints.structure import (
     CLOSED,
     CLOSING_STEPS,
@@ -23,7 +23,6 @@ from srm_mbs.dynamics.constraints.structure import (
     ZERO_ROW,
     ManifoldSampler,
     RandomSteps,
-    Samples,
     Structure,
     random_steps,
     row_names,
@@ -51,22 +50,23 @@ class ReusableAnalysis:
     ----------
     structure
         The analysis.
-    lengths : (rows,)
+    lengths
         Largest norm of each row, over its scale, on the walk.
     last_pivot
         Median of the last structural pivot.
     rows, in_use
         The rows of the closures, unscaled, and those that are kept, scaled.
-    loops
-        The closures.
+    loops, carriers
+        The closures, and the :meth:`~srm_mbs.model.anchors.Anchor.carrier` of each anchor.
     """
 
     structure: Structure
-    lengths: FloatArray
+    lengths: list[float]
     last_pivot: float
     rows: DrivenKinematics
     in_use: DrivenKinematics
     loops: tuple[LoopClosure, ...]
+    carriers: tuple[tuple[pin.SE3 | None, ...], ...]
 
     @classmethod
     def of(cls, mechanism: MechanismData) -> ReusableAnalysis | None:
@@ -75,45 +75,38 @@ class ReusableAnalysis:
         walked = None if structure.notes else _walked(structure, mechanism)
         if walked is None:
             return None
-        last_pivot = median(walked.last_pivots(structure.rank).tolist())
         rows, in_use = unscaled_rows(mechanism), rows_in_use(mechanism)
-        return cls(structure, walked.largest, last_pivot, rows, in_use, mechanism.loops)
+        model, loops = mechanism.model, mechanism.loops
+        carriers = tuple(tuple(end.carrier(model) for end in loop.anchors) for loop in loops)
+        return cls(structure, *walked, rows, in_use, loops, carriers)
 
     def lend_rows(self, mechanism: MechanismData) -> None:
-        """Give ``mechanism``, a variant whose tree has the same bodies and joints, the unscaled
-        rows with the places of its own closures, where these alone differ."""
-        if mechanism.drives:
-            return  # points that they move are anchors, too
+        """Give ``mechanism``, a variant whose tree has the same bodies, joints and frames, the
+        unscaled rows with the places of its own closures, where these alone differ."""
         loops = mechanism.loops
-        if not all(loop.anchors for loop in loops):
-            return  # couplings have no places
-        known = self._places_of(self.rows)
-        places = [known.get(id(loop)) or loop.resolve(mechanism.model) for loop in loops]
-        rows = self.rows.moved(loops, places)
+        if mechanism.drives or len(loops) != len(self.loops):
+            return  # points that drives move are anchors, too
+        if any(loop.rows is not own.rows for loop, own in zip(loops, self.loops)):
+            return
+        origins = [
+            known.origin_of(anchor, carrier)
+            for loop, own, carriers in zip(loops, self.loops, self.carriers)
+            for known, anchor, carrier in zip(own.anchors, loop.anchors, carriers)
+        ]
+        known = [origin for origin in origins if origin is not None]
+        rows = self.rows.moved(loops, known) if len(known) == len(origins) else None
         if rows is not None:
             unscaled_rows.keep(mechanism, rows)
             anchor_points.keep(mechanism, rows.anchors())
 
     def lend_rows_in_use(self, mechanism: MechanismData) -> None:
-        """The same with the rows in use, for a variant that has this analysis and those of
+        """The same with the rows in use, for a variant that has this analysis and the rows of
         :meth:`lend_rows`."""
         unscaled = unscaled_rows.kept(mechanism)
-        if unscaled is not None and not mechanism.drives:
-            known, loops = self._places_of(self.in_use), mechanism.loops
-            places = [known.get(id(loop), place) for loop, place in zip(loops, unscaled.places())]
-            rows = self.in_use.moved(loops, places)
+        if unscaled is not None and unscaled.idle is self.rows.idle:
+            rows = self.in_use.moved(mechanism.loops, unscaled.origins)
             if rows is not None:
                 rows_in_use.keep(mechanism, rows)
-
-    def _places_of(self, rows: DrivenKinematics) -> dict[int, Places]:
-        """The places of the closures in ``rows``, by their identity: variants that have the same
-        closures have them there."""
-        places = rows.places()
-        return (
-            {id(loop): place for loop, place in zip(self.loops, places)}
-            if len(places) == len(self.loops)
-            else {}
-        )
 
     def for_variant(self, mechanism: MechanismData) -> Structure | None:
         """The analysis in the units of ``mechanism``, a variant; None where it is not valid.
@@ -135,11 +128,11 @@ class ReusableAnalysis:
         walked = _walked(structure, mechanism)
         if walked is None:
             return None
-        used = structure.kept
-        ratios = walked.largest[used] / self.lengths[used]
-        pivot = median(walked.last_pivots(structure.rank).tolist())
-        ratios = np.append(ratios, pivot / self.last_pivot)
-        if not (ratios.min() > 1.0 / SIMILAR and ratios.max() < SIMILAR):
+        lengths, pivot = walked
+        used = structure.kept.tolist()
+        ratios = [a / b for a, b, own in zip(lengths, self.lengths, used) if own]
+        ratios.append(pivot / self.last_pivot)
+        if not (min(ratios) > 1.0 / SIMILAR and max(ratios) < SIMILAR):
             return None
         return structure.at(mechanism)
 
@@ -153,9 +146,10 @@ def _steps(nv: int) -> RandomSteps:
     return steps
 
 
-def _walked(structure: Structure, mechanism: MechanismData) -> Samples | None:
+def _walked(structure: Structure, mechanism: MechanismData) -> tuple[list[float], float] | None:
     """A walk of ``CHECKED_STEPS`` from the start of ``mechanism``, with the row scales of
-    ``structure``; None if it contradicts the ranks and zero rows of that, or finds nothing."""
+    ``structure``: the largest norm of each row, and the median of the last structural pivot; None
+    if it contradicts the ranks and zero rows of that, or finds nothing."""
     rank = structure.rank
     sampler = ManifoldSampler(mechanism, coordinate_units(mechanism, mechanism.q0, mechanism.v0))
     sampler.scale, sampler.eliminations = structure.row_scale, structure.eliminations
@@ -165,15 +159,21 @@ def _walked(structure: Structure, mechanism: MechanismData) -> Samples | None:
     walk = [_steps(int(mechanism.model.nv))]
     samples = sampler.explore_along(start, walk, mechanism.v0, sample_start=True)
     sampler.end()
-    loops = int((samples.of_loops > STRUCTURAL_PIVOT).sum(axis=1).max())
-    if int(samples.ranks().max()) != rank or loops != structure.loop_rank:
+    # Lists, because there are few numbers: a reduction of NumPy takes as long as all this.
+    pivots, largest = samples.pivots.tolist(), samples.largest.tolist()
+    ranks = _ranks(pivots)
+    if max(ranks) != rank or max(_ranks(samples.of_loops.tolist())) != structure.loop_rank:
         return None
-    in_use = samples.largest > ZERO_ROW
-    in_use[sampler.closed :] = True
-    if not np.array_equal(in_use, structure.kept) or not samples.largest[in_use].all():
+    in_use = [row >= sampler.closed or size > ZERO_ROW for row, size in enumerate(largest)]
+    if in_use != structure.kept.tolist() or not all(compress(largest, in_use)):
         return None
-    if rank < samples.pivots.shape[1]:
-        redundant = max(float(samples.pivots[:, rank:].max()), PIVOT_ZERO)
-        if float(samples.last_pivots(rank).min()) < RANK_GAP * redundant:
-            return None
-    return samples
+    last = [own[rank - 1] for own, found in zip(pivots, ranks) if found == rank]
+    redundant = max((pivot for own in pivots for pivot in own[rank:]), default=0.0)
+    if rank < len(pivots[0]) and min(last) < RANK_GAP * max(redundant, PIVOT_ZERO):
+        return None
+    return largest, median(last)
+
+
+def _ranks(pivots: list[list[float]]) -> list[int]:
+    """The number of independent rows in each of several configurations."""
+    return [sum(pivot > STRUCTURAL_PIVOT for pivot in own) for own in pivots]

@@ -28,18 +28,22 @@ body that is at x.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from copy import copy
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs._kernel.workspace import workspace
+from srm_mbs._kernel.workspace import LARGE, workspace
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.lazy import cached_property
 
+KEPT_SYSTEMS = 4
+"""Kernel systems of one mechanism that wait for users, at most; of a large mechanism one."""
 Vector = Sequence[float]
 """Three numbers."""
 Triple = tuple[float, float, float]
@@ -259,10 +263,6 @@ class _Body:
         self.spin_bias = bias.angular.tolist
 
 
-Places = tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]
-"""Joint, and placement in it, of both anchors of a closure."""
-
-
 class _LoopRows:
     """The kept, scaled rows of one closure between anchors, resolved against a model."""
 
@@ -270,11 +270,13 @@ class _LoopRows:
         self, model: pin.Model, loop: LoopClosure, scale: FloatArray, keep: BoolArray, start: int
     ) -> None:
         self.name = loop.name
-        (self.joint_a, self.in_a), (self.joint_b, self.in_b) = loop.resolve(model)
+        (self.joint_a, in_a), (self.joint_b, in_b) = loop.resolve(model)
         rows = loop.rows
         k, turns = len(rows.directions), rows.blocks[1]
         inverse = 1.0 / scale
-        self.directions = (rows.directions * inverse[:k, None])[keep[:k]]
+        # The rows in the axes of the joints, as plain floats.
+        directions = (rows.directions * inverse[:k, None])[keep[:k]]
+        self._d: list[list[float]] = (directions @ in_b.rotation.T).tolist()
         # With their factor, the inverse of the row scale.
         self._distances = [
             (length, float(factor))
@@ -283,30 +285,22 @@ class _LoopRows:
         ]
         pairs = rows.alignments[keep[turns]]
         # The row scale sits in n, so that no evaluation has to divide.
-        self.alignments = [
-            (u, n) for u, n in zip(pairs[:, 0], pairs[:, 1] * inverse[turns][keep[turns], None])
+        self._un = [
+            ((in_a.rotation @ u).tolist(), (in_b.rotation @ n).tolist())
+            for u, n in zip(pairs[:, 0], pairs[:, 1] * inverse[turns][keep[turns], None])
         ]
+        self._at_a: list[float] = in_a.translation.tolist()
+        self._at_b: list[float] = in_b.translation.tolist()
         self.support = support(model, self.joint_a) - support(model, self.joint_b)
         self.first_row = start
-        self.count = len(self.directions) + len(self._distances) + len(self.alignments)
-        self._take_places()
+        self.count = len(self._d) + len(self._distances) + len(self._un)
 
-    def _take_places(self) -> None:
-        """Find the rows in the axes of the joints, as plain floats."""
-        self._at_a: list[float] = self.in_a.translation.tolist()
-        self._at_b: list[float] = self.in_b.translation.tolist()
-        self._d: list[list[float]] = (self.directions @ self.in_b.rotation.T).tolist()
-        self._un = [
-            ((self.in_a.rotation @ u).tolist(), (self.in_b.rotation @ n).tolist())
-            for u, n in self.alignments
-        ]
-
-    def constants(self) -> dict[str, Any]:
+    @cached_property
+    def _unmoved(self) -> dict[str, Any]:
+        """The :meth:`constants` that are the same in other places."""
         return {
             "joint_a": self.joint_a,
             "joint_b": self.joint_b,
-            "at_a": np.array(self._at_a),
-            "at_b": np.array(self._at_b),
             "directions": np.array(self._d, dtype=float).ravel(),
             "distances": np.array(self._distances, dtype=float).ravel(),
             "alignments": np.array(self._un, dtype=float).ravel(),
@@ -314,21 +308,18 @@ class _LoopRows:
             "first_row": self.first_row,
         }
 
+    def constants(self) -> dict[str, Any]:
+        return self._unmoved | {"at_a": np.array(self._at_a), "at_b": np.array(self._at_b)}
+
     def origins(self) -> list[tuple[int, list[float]]]:
         """Joint, and origin (3,) in its axes, of both anchors."""
         return [(self.joint_a, self._at_a), (self.joint_b, self._at_b)]
 
-    def moved(self, name: str, places: Places) -> _LoopRows | None:
-        """The same rows of a closure ``name`` between these places; None if they are on other
-        bodies."""
-        (joint_a, in_a), (joint_b, in_b) = places
-        if in_a is self.in_a and in_b is self.in_b and name == self.name:
-            return self  # no one evaluates these rows, but copies of their workspace
-        if joint_a != self.joint_a or joint_b != self.joint_b:
-            return None
+    def moved(self, name: str, at_a: list[float], at_b: list[float]) -> _LoopRows:
+        """The same rows of a closure ``name`` with the origins of its anchors at these places."""
         other = self.copy_workspace()
-        other.name, other.in_a, other.in_b = name, in_a, in_b
-        other._take_places()
+        other.name, other._at_a, other._at_b = name, at_a, at_b
+        other._unmoved = self._unmoved
         return other
 
     def bind(self, data: pin.Data) -> None:
@@ -340,14 +331,8 @@ class _LoopRows:
         # As copy() does, which takes three times as long.
         other = object.__new__(_LoopRows)
         other.name, other.first_row, other.count = self.name, self.first_row, self.count
-        other.joint_a, other.in_a, other.joint_b, other.in_b = (
-            self.joint_a,
-            self.in_a,
-            self.joint_b,
-            self.in_b,
-        )
-        other.directions, other.alignments = self.directions, self.alignments
-        other._distances, other.support = self._distances, self.support
+        other.joint_a, other.joint_b, other.support = self.joint_a, self.joint_b, self.support
+        other._distances = self._distances
         other._at_a, other._at_b, other._d, other._un = self._at_a, self._at_b, self._d, self._un
         return other
 
@@ -456,6 +441,8 @@ class LoopKinematics:
         Closure errors, their Jacobian in tangent coordinates, and Gdot v, after :meth:`update`.
     target_rate : (m,)
         s' of the drives, so that the rates of the errors are G v - s'; 0 in the rows of loops.
+    idle
+        Kernel systems with these rows that nobody uses, also of mechanisms where they are moved.
     """
 
     def __init__(
@@ -486,14 +473,17 @@ class LoopKinematics:
             if isinstance(resolved, _LoopRows):
                 self._anchored = m
         self._support = np.concatenate(supports)
-        self._row_sets = [loop.rows for loop in loops]
         place = (np.cumsum(mask) - 1).tolist()
         size = scale.tolist()
         self._eliminations = [
             Elimination(place[row], place[other], factor * size[other] / size[row])
             for row, other, factor in eliminations
         ]
+        self.idle: deque[Any] = deque(maxlen=1 if model.nv > LARGE else KEPT_SYSTEMS)
         self._allocate()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"idle": deque(maxlen=self.idle.maxlen)}
 
     def _allocate(self) -> None:
         m = len(self._support)
@@ -514,31 +504,28 @@ class LoopKinematics:
         other._allocate()
         return other
 
-    def moved(self, loops: Sequence[LoopClosure], places: Sequence[Places]) -> Self | None:
-        """The same rows of ``loops``, whose anchors are at ``places`` in a tree of the same bodies
-        and joints; None where more than these differs, or might."""
-        sets = [loop.rows for loop in loops]
-        known = self._row_sets
-        if len(sets) != len(known) or any(a is not b for a, b in zip(sets, known)):
-            return None
-        found = [
-            rows.moved(loop.name, own) if isinstance(rows, _LoopRows) else None
-            for rows, loop, own in zip(self._loops, loops, places)
-        ]
-        if len(found) != len(loops) or None in found:  # joint rows, and closures without any
+    def moved(self, loops: Sequence[LoopClosure], origins: Sequence[list[float]]) -> Self | None:
+        """The same rows of ``loops``, with other :attr:`origins` in a tree of the same bodies and
+        joints, and with the same idle kernel systems; None unless all are between anchors and have
+        rows.
+
+        As of these rows, only copies of their workspace may be evaluated.
+        """
+        if self._joint_rows or len(loops) != len(self._loops):
             return None
         other = copy(self)
-        other._loops = [rows for rows in found if rows is not None]
-        other._allocate()
+        other._loops = [
+            cast(_LoopRows, rows).moved(loop.name, at_a, at_b)
+            for rows, loop, at_a, at_b in zip(self._loops, loops, origins[::2], origins[1::2])
+        ]
+        other.idle = self.idle
         return other
 
-    def places(self) -> list[Places]:
-        """The places of all closures between anchors that have rows."""
-        return [
-            ((rows.joint_a, rows.in_a), (rows.joint_b, rows.in_b))
-            for rows in self._loops
-            if isinstance(rows, _LoopRows)
-        ]
+    @property
+    def origins(self) -> list[list[float]]:
+        """Origins (3,) of the anchors a and b of all closures that have rows, each in the axes of
+        its joint."""
+        return [origin for _, origin in self.anchors()]
 
     def anchors(self) -> list[tuple[int, list[float]]]:
         """Joint, and origin (3,) in its axes, of the anchors of all closures that have rows."""

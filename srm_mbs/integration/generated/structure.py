@@ -478,6 +478,8 @@ def parameters_of_variant(
             elif isinstance(value, int):
                 if value != others[key]:
                     return None
+            elif value is others[key]:  # rows that were moved share it
+                continue
             elif value.shape != others[key].shape or value.tobytes() != others[key].tobytes():
                 return None
     # Where a number was 0, a sign or no sign, the structure is another.

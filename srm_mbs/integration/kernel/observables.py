@@ -79,6 +79,8 @@ class _Lent:
     def __enter__(self) -> Any:
         try:
             self._kernel_system = self._idle.pop()  # two threads never get the same
+            mechanism = self._mechanism
+            self._kernel_system.move(mechanism.model, unscaled_rows(mechanism).origins)
         except IndexError:
             self._kernel_system = _make_all_rows(self._system or make_system(self._mechanism))
         return self._kernel_system

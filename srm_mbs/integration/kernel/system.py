@@ -11,6 +11,8 @@ import numpy as np
 
 from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.rows import KEPT_SYSTEMS
+from srm_mbs.dynamics.constraints.structure import rows_in_use, structure_of
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.system import Zone
 from srm_mbs.integration.kernel.branch_motion import CompiledBranchNodes, CompiledNodes
@@ -18,7 +20,7 @@ from srm_mbs.integration.kernel.marshalling import system_struct
 from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.model.mechanism import MechanismData, per_model
 
-KEPT = 4
+KEPT = KEPT_SYSTEMS
 """Idle workspaces that a mechanism keeps at most."""
 LARGEST_KEPT = 64
 """Coordinates of a mechanism that keeps any: one takes 1.7 MB there."""
@@ -57,8 +59,11 @@ def shared(system: ClosedSystem | OpenSystem) -> bool:
 
 @per_model
 def idle_workspaces(mechanism: MechanismData) -> deque[Any]:
-    """The pool of a mechanism: kernel systems of :func:`shared` ones that no run uses."""
-    return deque(maxlen=KEPT)
+    """The pool of a mechanism: kernel systems of :func:`shared` ones that no run uses; those of
+    variants with the same rows and without force elements are the same."""
+    if mechanism.forces or not structure_of(mechanism).rank:
+        return deque(maxlen=KEPT)
+    return rows_in_use(mechanism).idle
 
 
 class workspace:  # noqa: N801 - used as a function
@@ -140,6 +145,7 @@ def _idle_or_new(pool: deque[Any] | None, system: ClosedSystem | OpenSystem, cod
         kernel_system = pool.pop()  # deque: two threads never get the same
     except IndexError:  # the other one took the last
         return make_kernel_system(system, code)
+    kernel_system.move(system.model, system.origins)
     kernel_system.renew(**system.constants_of_start())
     kernel_system.use_code(code)
     return kernel_system

@@ -194,8 +194,18 @@ def test_a_model_whose_indices_contradict_each_other_is_refused() -> None:
 def test_a_workspace_is_not_renewed_with_arrays_of_other_sizes() -> None:
     system = ClosedSystem(load("four_bar"))
     kernel_system = core.System(system.model, marshalling.system_struct(system.constants()), None)
-    good = {"unit": np.ones(3), "gap_scale": np.ones(2), "damping": None, "friction": None}
+    good = system.constants_of_start() | {"damping": None, "friction": None}
     for name, size in (("unit", 2), ("gap_scale", 3), ("damping", 1), ("friction", 4)):
         with pytest.raises(ValueError, match=r"has \d numbers instead of \d"):
             kernel_system.renew(**good | {name: np.ones(size)})
     kernel_system.renew(**good)
+
+
+def test_a_workspace_does_not_move_to_other_joints_or_closures() -> None:
+    system = ClosedSystem(load("four_bar"))
+    kernel_system = core.System(system.model, marshalling.system_struct(system.constants()), None)
+    with pytest.raises(ValueError, match="origins has 0 numbers instead of 2"):
+        kernel_system.move(system.model, [])
+    with pytest.raises(ValueError, match="model has other joints"):
+        kernel_system.move(load("klann_walker").model, system.origins)
+    kernel_system.move(system.model, system.origins)

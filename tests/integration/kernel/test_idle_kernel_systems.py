@@ -8,6 +8,7 @@ import pickle
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,44 @@ def test_a_run_in_a_used_workspace_is_that_in_a_new_one() -> None:
     assert found.stats.factorisations == expected.stats.factorisations
     t = np.linspace(0.0, 0.02, 50)
     assert np.array_equal(found(t)[0], expected(t)[0])
+
+
+BARS = """format = 1
+[parameters]
+crank = 0.4
+[planar]
+ground = ["O", "C"]
+mass_per_length = 1.0
+rates = { O = 3.0 }
+points = { O = [0, 0], A = ["=0.6*crank", "=0.8*crank"], B = [1.0, 0.6], C = [1.0, 0] }
+bar = [
+  { name = "crank", points = ["O", "A"] },
+  { name = "coupler", points = ["A", "B"] },
+  { name = "rocker", points = ["B", "C"] },
+]
+"""
+
+
+def test_variants_run_in_workspaces_of_each_other_as_in_new_ones(tmp_path: Path) -> None:
+    """Each takes its own numbers to a workspace that another one left."""
+    path = tmp_path / "bars.toml"
+    path.write_text(BARS, encoding="utf-8")
+    base = srm.load(path)
+    variants = [base.with_parameters(crank=crank) for crank in (0.38, 0.4, 0.42)]
+    expected = [run(pickle.loads(pickle.dumps(variant))) for variant in variants]
+
+    def check(number: int) -> None:
+        found, own = run(variants[number]), expected[number]
+        assert np.array_equal(found.steps.states, own.steps.states)
+        for joint, wrenches in own.joint_reactions.items():
+            assert np.array_equal(found.joint_reactions[joint], wrenches), joint
+
+    for number in (0, 1, 2, 0):
+        check(number)
+    (workspace,) = idle(base)
+    assert all(idle(variant) == [workspace] for variant in variants)
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(check, [0, 1, 2] * 10))
 
 
 def test_runs_at_the_same_time_do_not_share() -> None:

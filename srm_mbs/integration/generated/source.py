@@ -43,6 +43,7 @@ def source_of(structure: Structure) -> Source:
         *(structure.held, linear.constant_count),
     )
     text = _TEMPLATE.format(
+        prototypes=PROTOTYPES,
         turns=_TURNS,
         sizes=", ".join(map(str, sizes)),
         constants=written.constants,
@@ -63,6 +64,13 @@ def _algebra(structure: Structure, targets: Sequence[str]) -> str:
             jacobian.add((int(places[0]), int(places[1])))
     return algebra_of(structure.nv, structure.rows, structure.rank, mass, jacobian)
 
+
+# Headers would take longer to read than the terms of a small mechanism.
+PROTOTYPES = """\
+double sqrt(double), fabs(double), copysign(double, double), fmax(double, double);
+double fmin(double, double), sin(double), cos(double), tanh(double);
+void *memcpy(void *, const void *, __SIZE_TYPE__), *memset(void *, int, __SIZE_TYPE__);"""
+"""Functions of C's library that the source calls."""
 
 LARGEST_ANGLE = 1e6
 """Angle (rad) up to which its multiple of pi/2 has the bits that its products leave: 20."""
@@ -123,8 +131,7 @@ _TEMPLATE = """\
  * M: upper triangle, column by column; nle; tau, lawful: forces of elements without and with laws;
  * values, own: laws of elements and of coordinates; g, bias; G[row][column]; B, J: kinematics of
  * the bodies of bushings. */
-#include <math.h>
-#include <string.h>
+{prototypes}
 
 /* Two equal operations at once; their constants are neighbours. */
 typedef double pair __attribute__((vector_size(16)));

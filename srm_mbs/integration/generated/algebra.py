@@ -225,6 +225,8 @@ typedef long long flags __attribute__((vector_size(8 * LANES)));
 #define EACH_VECTOR BODY(0) BODY(1) BODY(2)
 #elif WIDE == 4
 #define EACH_VECTOR BODY(0) BODY(1) BODY(2) BODY(3)
+#else
+#define EACH_VECTOR EACH(b, WIDE) BODY(b)
 #endif
 /* The vector b of a row of X, of which all entries are given. */
 #define TAKE(b, ...) TAKE_##b(__VA_ARGS__)

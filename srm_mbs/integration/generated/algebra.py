@@ -28,8 +28,9 @@ the kernel's sparse algebra costs less."""
 TAKEN = 8
 """Rows of G up to which vectors are put together of its entries, without a way through memory."""
 LARGEST_UNROLLED = 8
-"""Coordinates up to which loops over them are unrolled, and nothing is skipped but what is zero
-beforehand."""
+"""Coordinates up to which there are no loops over them, and nothing is skipped but what is zero
+beforehand.  The factorisation is then written statement by statement: a compiler that unrolls loops
+takes a third more time."""
 
 
 def algebra_of(
@@ -96,16 +97,17 @@ def algebra_of(
         "OTHERS": "\n".join(f"  take_row(w, G, {row});" for row in range(rows) if not support[row]),
     }
     if unrolled:
-        given = None
+        vectors: list[list[str]] | None = None
         if rows <= TAKEN and all(support):
-            given = [["0.0"] * TAKEN for _ in range(nv)]
+            vectors = [["0.0"] * TAKEN for _ in range(nv)]
             for row, i in jacobian:
-                given[last - i][row] = f"G[{row * nv + i}]"
+                vectors[last - i][row] = f"G[{row * nv + i}]"
             values |= {"CLEARED": "", "JACOBIAN": ""}
         ordered = [sorted(columns) for columns in later]
-        text = _HEAD + _unrolled_factor(ordered, entries, rank, given) + _SOLVES
+        factor = _unrolled_factor(ordered, entries, rank, vectors)
     else:
-        text = _HEAD + _SPARSE + _SOLVES
+        factor = _SPARSE
+    text = _HEAD + factor + _SOLVES
     for name, value in values.items():
         text = text.replace(f"@{name}@", str(value))
     return text
@@ -134,7 +136,8 @@ def _unrolled_factor(
     out += [f"double f{k} = f[{n - 1 - k}];" for k in range(n)]
     out.append("/* M = L D L^T: its chain of operations has no roots. */")
     for k in range(n):
-        out.append(f"const double d{k} = 1.0 / u{k}_{k};")
+        if later[k]:
+            out.append(f"const double d{k} = 1.0 / u{k}_{k};")
         for i in later[k]:
             out += [f"const double l{k}_{i} = d{k} * u{k}_{i};", f"f{i} -= l{k}_{i} * f{k};"]
             for j in later[k][later[k].index(i) :]:
@@ -157,7 +160,9 @@ def _unrolled_factor(
     body.append("sums[b] = " + " + ".join(f"w{k} * x{k}" for k in range(n)) + ";")
     body.append("squares[b] = " + " + ".join(f"x{k} * x{k}" for k in range(n)) + ";")
     out += _each_vector(body)
-    out.append("const int finite = begin_columns(w, sums, squares, limits, bias, gamma, row_squares);")
+    out.append(
+        "const int finite = begin_columns(w, sums, squares, limits, bias, gamma, row_squares);"
+    )
     out.append("EACH(b, WIDE) w->rows[b] = ~(flags){0};")
     for k in range(rank):
         out += ["{", *_reflection(k, n), "}"]
@@ -167,7 +172,13 @@ def _unrolled_factor(
 
 def _each_vector(body: Sequence[str]) -> list[str]:
     """Statements for each vector ``b`` of a row."""
-    return ["#define BODY(b) { \\", *[f"  {line} \\" for line in body], "}", "EACH_VECTOR", "#undef BODY"]
+    return [
+        "#define BODY(b) { \\",
+        *[f"  {line} \\" for line in body],
+        "}",
+        "EACH_VECTOR",
+        "#undef BODY",
+    ]
 
 
 def _reflection(k: int, n: int) -> list[str]:

@@ -18,16 +18,19 @@ the same rules for pivots, and differs where that saves work:
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 LARGEST = 64
 """Coordinates or rows up to which it is generated: a set of rows has as many bits, and beyond it
 the kernel's sparse algebra costs less."""
 
 
+TAKEN = 8
+"""Rows of G up to which vectors are put together of its entries, without a way through memory."""
 LARGEST_UNROLLED = 8
-"""Coordinates up to which loops over them are unrolled, and nothing is skipped but what is zero
-beforehand."""
+"""Coordinates up to which there are no loops over them, and nothing is skipped but what is zero
+beforehand.  The factorisation is then written statement by statement: a compiler that unrolls loops
+takes a third more time."""
 
 
 def algebra_of(
@@ -72,7 +75,7 @@ def algebra_of(
         columns_of_rows += sorted(columns)
         starts.append(len(columns_of_rows))
     unrolled = nv <= LARGEST_UNROLLED
-    entry = "U[{}][{}]" if unrolled else "AT(U[{}], {})"
+    entries = [(k, i) for k in range(nv) for i in (k, *given[k])]
     values = {
         "LOOPS": _UNROLLED_LOOPS if unrolled else _LOOPS,
         "CLEARED": _UNROLLED_CLEARED if unrolled else _CLEARED,
@@ -86,25 +89,131 @@ def algebra_of(
         "SUPPORT": ", ".join(f"{bits:#x}u" for bits in support),
         "SHORT": 0 if unrolled else 4,
         "MASS": "\n".join(
-            f"  {entry.format(k, i)} = M[{(last - k) * nv + last - i}];"
-            for k in range(nv)
-            for i in (k, *given[k])
+            f"  AT(U[{k}], {i}) = M[{(last - k) * nv + last - i}];" for k, i in entries
         ),
         "JACOBIAN": "\n".join(
             f"  AT(X[{last - i}], {row}) = G[{row * nv + i}];" for row, i in sorted(jacobian)
         ),
         "OTHERS": "\n".join(f"  take_row(w, G, {row});" for row in range(rows) if not support[row]),
     }
-    text = _HEAD + (_UNROLLED if unrolled else _SPARSE) + _SOLVES
+    if unrolled:
+        vectors: list[list[str]] | None = None
+        if rows <= TAKEN and all(support):
+            vectors = [["0.0"] * TAKEN for _ in range(nv)]
+            for row, i in jacobian:
+                vectors[last - i][row] = f"G[{row * nv + i}]"
+            values |= {"CLEARED": "", "JACOBIAN": ""}
+        ordered = [sorted(columns) for columns in later]
+        factor = _unrolled_factor(ordered, entries, rank, vectors)
+    else:
+        factor = _SPARSE
+    text = _HEAD + factor + _SOLVES
     for name, value in values.items():
         text = text.replace(f"@{name}@", str(value))
     return text
 
 
+def _unrolled_factor(
+    later: Sequence[Sequence[int]],
+    mass: Sequence[tuple[int, int]],
+    rank: int,
+    given: Sequence[Sequence[str]] | None,
+) -> str:
+    """The factorisation without a loop over coordinates.
+
+    Parameters
+    ----------
+    later
+        Columns of U in each of its rows, without the diagonal.
+    mass
+        Row and column of U of the entries of M.
+    given
+        Entries (nv, TAKEN) of G^T in the order of U, in C; None where X has them.
+    """
+    n = len(later)
+    known = set(mass)
+    out = [f"double u{k}_{i} = M[{(n - 1 - k) * n + n - 1 - i}];" for k, i in mass]
+    out += [f"double f{k} = f[{n - 1 - k}];" for k in range(n)]
+    out.append("/* M = L D L^T: its chain of operations has no roots. */")
+    for k in range(n):
+        if later[k]:
+            out.append(f"const double d{k} = 1.0 / u{k}_{k};")
+        for i in later[k]:
+            out += [f"const double l{k}_{i} = d{k} * u{k}_{i};", f"f{i} -= l{k}_{i} * f{k};"]
+            for j in later[k][later[k].index(i) :]:
+                if (i, j) in known:
+                    out.append(f"u{i}_{j} -= l{k}_{i} * u{k}_{j};")
+                else:
+                    known.add((i, j))
+                    out.append(f"double u{i}_{j} = -(l{k}_{i} * u{k}_{j});")
+    positive = " & ".join(f"(u{k}_{k} > 0.0)" for k in range(n))
+    out.append(f"if (!({positive})) return 1;")
+    for k in range(n):
+        out.append(f"const double r{k} = sqrt(u{k}_{k}), b{k} = 1.0 / r{k}, w{k} = b{k} * f{k};")
+        out += [f"w->inverse[{k}] = b{k};", f"white[{k}] = w{k};", f"AT(w->U[{k}], {k}) = r{k};"]
+        out += [f"AT(w->U[{k}], {i}) = b{k} * u{k}_{i};" for i in later[k]]
+    body = []
+    for k in range(n):
+        taken = "".join(f" - l{m}_{k} * y{m}" for m in range(k) if k in later[m])
+        first = f"X[{k}][b]" if given is None else f"TAKE(b, {', '.join(given[k])})"
+        body += [f"const vec y{k} = {first}{taken};", f"const vec x{k} = X[{k}][b] = b{k} * y{k};"]
+    body.append("sums[b] = " + " + ".join(f"w{k} * x{k}" for k in range(n)) + ";")
+    body.append("squares[b] = " + " + ".join(f"x{k} * x{k}" for k in range(n)) + ";")
+    out += _each_vector(body)
+    out.append(
+        "const int finite = begin_columns(w, sums, squares, limits, bias, gamma, row_squares);"
+    )
+    out.append("EACH(b, WIDE) w->rows[b] = ~(flags){0};")
+    for k in range(rank):
+        out += ["{", *_reflection(k, n), "}"]
+    out += [f"w->pivot_row[{k}] = {k};" for k in range(n)]
+    return "\n".join(f"  {line}" for line in out) + "\n"
+
+
+def _each_vector(body: Sequence[str]) -> list[str]:
+    """Statements for each vector ``b`` of a row."""
+    return [
+        "#define BODY(b) { \\",
+        *[f"  {line} \\" for line in body],
+        "}",
+        "EACH_VECTOR",
+        "#undef BODY",
+    ]
+
+
+def _reflection(k: int, n: int) -> list[str]:
+    """Step ``k`` of the factorisation of W."""
+    rows = range(k, n)
+    column = f"next_column(w, {k}, squares, limits, {(1 << n) - (1 << k):#x}u)"
+    out = [f"const double *const own = (const double *)X + {column};"]
+    out += [f"const double v{i} = own[{i} * WIDE * LANES];" for i in rows]
+    halves = (" + ".join(f"v{i} * v{i}" for i in rows[part::2]) or "0.0" for part in range(2))
+    out.append(f"const double norm2 = ({') + ('.join(halves)});")
+    out += [
+        "/* 1 / beta, without waiting for the root. */",
+        f"const double alpha = v{k}, beta = -copysign(sqrt(norm2), alpha);",
+        "const double by = beta * (1.0 / norm2);",
+        "const double scale = norm2 > 0.0 ? 1.0 / (alpha - beta) : 0.0;",
+        f"pivots[{k}] = fabs(beta);",
+        f"w->inverse_pivot[{k}] = by;",
+        f"w->tau[{k}] = norm2 > 0.0 ? (beta - alpha) * by : 0.0;",
+        f"w->count[{k}] = N;",
+        f"EACH(b, HIGH) V[{k}][b] = (vec){{0}};",
+        f"AT(V[{k}], {k}) = 1.0;",
+    ]
+    out += [f"const double s{i} = AT(V[{k}], {i}) = scale * v{i};" for i in rows[1:]]
+    sums = " + ".join(f"v{i} * X[{i}][b]" for i in rows)
+    body = [
+        f"const vec row = X[{k}][b], R = by * ({sums}), moved = row - R;",
+        f"X[{k}][b] = R;",
+        "squares[b] -= R * R;",
+        *[f"X[{i}][b] -= s{i} * moved;" for i in rows[1:]],
+    ]
+    return [*out, "if (norm2 > 0.0) {", *_each_vector(body), "}"]
+
+
 _HEAD = """
-#include <stddef.h>
-#include <stdint.h>
-#include <string.h>
+typedef __UINT64_TYPE__ uint64_t;
 
 #define N @N@
 #define ROWS @ROWS@
@@ -118,14 +227,38 @@ _HEAD = """
 #endif
 typedef double vec __attribute__((vector_size(8 * LANES)));
 typedef long long flags __attribute__((vector_size(8 * LANES)));
-enum { WIDE = (ROWS + LANES - 1) / LANES, HIGH = (N + LANES - 1) / LANES, SHORT = @SHORT@ };
+#define WIDE ((ROWS + LANES - 1) / LANES)
+#if WIDE == 1
+#define EACH_VECTOR BODY(0)
+#elif WIDE == 2
+#define EACH_VECTOR BODY(0) BODY(1)
+#elif WIDE == 3
+#define EACH_VECTOR BODY(0) BODY(1) BODY(2)
+#elif WIDE == 4
+#define EACH_VECTOR BODY(0) BODY(1) BODY(2) BODY(3)
+#else
+#define EACH_VECTOR EACH(b, WIDE) BODY(b)
+#endif
+/* The vector b of a row of X, of which all entries are given. */
+#define TAKE(b, ...) TAKE_##b(__VA_ARGS__)
+#if LANES == 8
+#define TAKE_0(...) (vec){__VA_ARGS__}
+#elif LANES == 4
+#define TAKE_0(p, q, r, s, ...) (vec){p, q, r, s}
+#define TAKE_1(p, q, r, s, ...) (vec){__VA_ARGS__}
+#else
+#define TAKE_0(p, q, ...) (vec){p, q}
+#define TAKE_1(p, q, r, s, ...) (vec){r, s}
+#define TAKE_2(p, q, r, s, t, u, ...) (vec){t, u}
+#define TAKE_3(p, q, r, s, t, u, v, w) (vec){v, w}
+#endif
+enum { HIGH = (N + LANES - 1) / LANES, SHORT = @SHORT@ };
 #define EACH(b, count) _Pragma("GCC unroll 16") for (int b = 0; b < count; ++b)
 #define UNROLL(i, first, count) _Pragma("GCC unroll 8") for (int i = first; i < count; ++i)
 /* k = 0, 1, ... and backwards, and the columns of U in its row k, backwards: loops that vanish if
  * they are unrolled. */
 #define ALWAYS_INLINE inline __attribute__((always_inline))
-#define UP_FROM(k, first, count) _Pragma(UNROLLED) for (int k = first; k < (count); ++k)
-#define UP(k, count) UP_FROM(k, 0, count)
+#define UP(k, count) _Pragma(UNROLLED) for (int k = 0; k < (count); ++k)
 #define DOWN(k, count) _Pragma(UNROLLED) for (int k = (count) - 1; k >= 0; --k)
 @LOOPS@
 #define AT(x, i) (((double *)(x))[i])
@@ -150,7 +283,7 @@ typedef struct {
   unsigned char count[RANK], entry[RANK][SHORT + 1];  /* of the entries without gaps: their rows */
 } Factors;
 
-const size_t srm_mbs_factors_size = sizeof(Factors);
+const __SIZE_TYPE__ srm_mbs_factors_size = sizeof(Factors);
 
 /* A row of G of which any entry may differ from zero. */
 static inline void take_row(Factors *w, const double *G, int row) {
@@ -180,7 +313,7 @@ static ALWAYS_INLINE int next_column(Factors *w, int k, vec *squares, vec *limit
   const double *const square = (const double *)squares, *const limit = (const double *)limits;
   double most = -1.0;
   int best = k;
-  UP_FROM(n, k, ROWS) {
+  for (int n = k; n < ROWS; ++n) {
     const int j = w->order[n];
     if (square[j] < limit[j]) square_again(w, j, squares, limits, active);
     if (square[j] > most) most = square[j], best = n;
@@ -200,7 +333,7 @@ static inline int begin_columns(Factors *w, const vec *sums, const vec *squares,
     w->order[j] = j;
     gamma[j] = AT(sums, j) + bias[j];
     row_squares[j] = AT(squares, j);
-    finite &= row_squares[j] < INFINITY;
+    finite &= row_squares[j] < __builtin_inf();
   }
   return finite;
 }
@@ -402,73 +535,8 @@ static ALWAYS_INLINE void full_normal(const Factors *w, const double *restrict g
   memcpy(white, x, N * sizeof *white);
 }"""
 
-_UNROLLED = """\
-  double U[N][N] = {{0}}, L[N][N], force[N];
-@MASS@
-  UNROLL(k, 0, N) force[k] = f[N - 1 - k];
-  /* M = L D L^T: its chain of operations has no roots. */
-  UNROLL(k, 0, N) {
-    if (!(U[k][k] > 0.0)) return 1;
-    const double by = 1.0 / U[k][k];
-    UNROLL(i, k + 1, N) if (reach[k] >> i & 1) {
-      const double l = L[k][i] = by * U[k][i];
-      force[i] -= l * force[k];
-      UNROLL(j, i, N) if (reach[k] >> j & 1) U[i][j] -= l * U[k][j];
-    }
-  }
-  UNROLL(k, 0, N) {
-    const double diagonal = sqrt(U[k][k]), by = 1.0 / diagonal;
-    w->inverse[k] = by;
-    white[k] = by * force[k];
-    AT(w->U[k], k) = diagonal;
-    UNROLL(i, k + 1, N) if (reach[k] >> i & 1) {
-      AT(w->U[k], i) = by * U[k][i];
-      EACH(b, WIDE) X[i][b] -= L[k][i] * X[k][b];
-    }
-    EACH(b, WIDE) {
-      const vec x = X[k][b] *= by;
-      sums[b] += white[k] * x;
-      squares[b] += x * x;
-    }
-  }
-  const int finite = begin_columns(w, sums, squares, limits, bias, gamma, row_squares);
-  EACH(b, WIDE) w->rows[b] = ~(flags){0};
-  UNROLL(k, 0, RANK) {
-    const int column = next_column(w, k, squares, limits, (uint64_t)((1 << N) - (1 << k)));
-    double v[N], norms[2] = {0.0, 0.0};
-    vec s[WIDE];
-    EACH(b, WIDE) s[b] = (vec){0};
-    UNROLL(i, k, N) {
-      v[i] = AT(X[i], column);
-      norms[i & 1] += v[i] * v[i];
-      EACH(b, WIDE) s[b] += v[i] * X[i][b];
-    }
-    const double norm2 = norms[0] + norms[1];
-    /* 1 / beta, without waiting for the root. */
-    const double alpha = v[k], beta = -copysign(sqrt(norm2), alpha), by = beta * (1.0 / norm2);
-    const double scale = norm2 > 0.0 ? 1.0 / (alpha - beta) : 0.0;
-    pivots[k] = fabs(beta);
-    w->inverse_pivot[k] = by;
-    w->tau[k] = norm2 > 0.0 ? (beta - alpha) * by : 0.0;
-    w->pivot_row[k] = k;
-    w->count[k] = N;
-    EACH(b, HIGH) V[k][b] = (vec){0};
-    AT(V[k], k) = 1.0;
-    UNROLL(i, k + 1, N) AT(V[k], i) = v[i] *= scale;
-    if (!(norm2 > 0.0)) continue;
-    EACH(b, WIDE) {
-      const vec R = by * s[b];
-      s[b] = X[k][b] - R;
-      X[k][b] = R;
-      squares[b] -= R * R;
-    }
-    UNROLL(i, k + 1, N) EACH(b, WIDE) X[i][b] -= v[i] * s[b];
-  }
-  UNROLL(k, RANK, N) w->pivot_row[k] = k;
-"""
-
 _SOLVES = """\
-  if (!finite) pivots[RANK - 1] = NAN;
+  if (!finite) pivots[RANK - 1] = __builtin_nan("");
   return 0;
 }
 
@@ -523,12 +591,7 @@ void srm_mbs_times_q(const void *work, int rank, int transposed, double *restric
   const Factors *const w = work;
   vec x[HIGH] = {{0}};
   memcpy(x, white, N * sizeof *white);
-  if (transposed)
-    for (int k = 0; k < rank; ++k) reflect(w, k, (double *)x);
-  else if (rank == RANK)
-    times_q(w, (double *)x);
-  else
-    for (int k = rank; k-- > 0;) reflect(w, k, (double *)x);
+  for (int k = 0; k < rank; ++k) reflect(w, transposed ? k : rank - 1 - k, (double *)x);
   memcpy(white, x, N * sizeof *white);
 }
 
@@ -570,10 +633,10 @@ void srm_mbs_whiten_force(const void *work, double *restrict x) {
   const Factors *const w = work;
   double t[N];
   for (int k = 0; k < N; ++k) t[k] = x[N - 1 - k];
-  UP(k, N) {
+  for (int k = 0; k < N; ++k) {
     const double *const u = (const double *)w->U[k];
     const double value = x[k] = t[k] * w->inverse[k];
-    LATER(i, k) t[i] -= u[i] * value;
+    for (int n = starts[k]; n < starts[k + 1]; ++n) t[later[n]] -= u[later[n]] * value;
   }
 }
 
@@ -582,10 +645,10 @@ void srm_mbs_whiten_velocity(const void *work, double *restrict x) {
   const Factors *const w = work;
   double t[N];
   for (int k = 0; k < N; ++k) t[k] = x[N - 1 - k];
-  UP(k, N) {
+  for (int k = 0; k < N; ++k) {
     const double *const u = (const double *)w->U[k];
     double sum = u[k] * t[k];
-    LATER(i, k) sum += u[i] * t[i];
+    for (int n = starts[k]; n < starts[k + 1]; ++n) sum += u[later[n]] * t[later[n]];
     x[k] = sum;
   }
 }

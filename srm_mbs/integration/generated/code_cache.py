@@ -56,6 +56,8 @@ FLAGS = (
     "-fno-gcse",
     *[text for name, most in _SEARCHES.items() for text in ("--param", f"{name}={most}")],
 )
+# Of C's library, the process has what the code takes of it; macOS links nothing without it.
+_LIBRARIES = ("-nostdlib", "-lm") if sys.platform == "linux" else ("-lm",)
 # Terms are scalars, of which a compiler finds pairs but hardly fours: to put these together takes
 # more instructions than it saves.  The algebra names the vectors that it has.
 _INTEL = ("-march=native", "-mprefer-vector-width=128")
@@ -420,7 +422,7 @@ class Compilation:
     def _start(self, folder: Path, niceness: int) -> None:
         """Start the compiler in the ``folder`` of its source."""
         made, text = (str(folder / f"{self._key}{suffix}") for suffix in (".so", ".c"))
-        command = [*self._compiler.command, *FLAGS, "-o", made, text, "-lm"]
+        command = [*self._compiler.command, *FLAGS, "-o", made, text, *_LIBRARIES]
         own = folder if self._library is None else self._library.with_name(_COMPILER_FOLDER)
         environment = {name: str(own) for name in self._compiler.folders} | os.environ
         try:

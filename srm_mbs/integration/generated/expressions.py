@@ -57,19 +57,22 @@ class Expression:
         return self.depends == CONSTANT and self.value == 0.0
 
     def __add__(self, other: Operand) -> Expression:
-        return self.recorder.add(self, self.recorder.node(other))
+        recorder = self.recorder
+        return recorder.add(self, other if type(other) is Expression else recorder.node(other))
 
     def __radd__(self, other: Operand) -> Expression:
         return self.recorder.add(self.recorder.node(other), self)
 
     def __sub__(self, other: Operand) -> Expression:
-        return self.recorder.subtract(self, self.recorder.node(other))
+        recorder = self.recorder
+        return recorder.subtract(self, other if type(other) is Expression else recorder.node(other))
 
     def __rsub__(self, other: Operand) -> Expression:
         return self.recorder.subtract(self.recorder.node(other), self)
 
     def __mul__(self, other: Operand) -> Expression:
-        return self.recorder.multiply(self, self.recorder.node(other))
+        recorder = self.recorder
+        return recorder.multiply(self, other if type(other) is Expression else recorder.node(other))
 
     def __rmul__(self, other: Operand) -> Expression:
         return self.recorder.multiply(self.recorder.node(other), self)
@@ -113,9 +116,17 @@ class Recorder:
         key: tuple[str | int, ...] = (operation, *[operand.number for operand in operands])
         found = self._nodes.get(key)
         if found is None:
-            depends = max(operand.depends for operand in operands)
-            found = Expression(self, operation, operands, depends)
-            self._nodes[key] = found
+            depends = max([operand.depends for operand in operands])
+            found = self._nodes[key] = Expression(self, operation, operands, depends)
+        return found
+
+    def _record_two(self, operation: str, a: Expression, b: Expression) -> Expression:
+        """The most frequent case of :meth:`_record`."""
+        key = (operation, a.number, b.number)
+        found = self._nodes.get(key)
+        if found is None:
+            depends = a.depends if a.depends > b.depends else b.depends
+            found = self._nodes[key] = Expression(self, operation, (a, b), depends)
         return found
 
     def add(self, a: Expression, b: Expression) -> Expression:
@@ -125,17 +136,17 @@ class Recorder:
                 return self.constant(a.value + b.value)
             if a.value == 0.0:
                 return b
-        if b.is_zero:
+        if b.depends == CONSTANT and b.value == 0.0:
             return a
         if b.operation == "negate":
             return self.subtract(a, b.operands[0])
         if a.operation == "negate":
             return self.subtract(b, a.operands[0])
-        return self._record("+", *((a, b) if a.number <= b.number else (b, a)))
+        return self._record_two("+", *((a, b) if a.number <= b.number else (b, a)))
 
     def subtract(self, a: Expression, b: Expression) -> Expression:
         """a - b"""
-        if b.is_zero:
+        if b.depends == CONSTANT and b.value == 0.0:
             return a
         if a is b:
             return self.zero
@@ -155,7 +166,7 @@ class Recorder:
                 return self.negate(b)
         if b.operation == "negate":
             return self.add(a, b.operands[0])
-        return self._record("-", a, b)
+        return self._record_two("-", a, b)
 
     def negate(self, a: Expression) -> Expression:
         """-a"""
@@ -191,7 +202,7 @@ class Recorder:
                 return self.multiply(self.multiply(a, factor), rest)
         if a.depends == b.depends and a.number > b.number:
             a, b = b, a
-        return self._record("*", a, b)
+        return self._record_two("*", a, b)
 
     def divide(self, a: Expression, b: Expression) -> Expression:
         """a / b; the divisor is not the constant 0."""
@@ -201,7 +212,7 @@ class Recorder:
             return a
         if a.operation == "negate":
             return self.negate(self.divide(a.operands[0], b))
-        return self._record("/", a, b)
+        return self._record_two("/", a, b)
 
     def call(self, function: str, *operands: Expression) -> Expression:
         """A function of C's mathematics, of one argument or two."""
@@ -249,17 +260,26 @@ def live_nodes(
     together = {} if together is None else together
     out: list[Expression] = []
     for root in roots:
-        stack = [(root, False)]
+        stack = [root]
         while stack:
-            node, ready = stack.pop()
+            node = stack[-1]
             if node.number in done:
+                stack.pop()
                 continue
-            nodes = together.get(node.number, (node,))
-            if ready or not node.operands:
-                done.update(own.number for own in nodes)
+            nodes = together.get(node.number)
+            operands = node.operands
+            if nodes is not None:
+                operands = tuple(operand for own in nodes for operand in own.operands)
+            left = [operand for operand in operands if operand.number not in done]
+            if left:
+                left.reverse()
+                stack += left
+                continue
+            stack.pop()
+            if nodes is None:
+                done.add(node.number)
+                out.append(node)
+            else:
+                done.update([own.number for own in nodes])
                 out.append(nodes[0])
-                continue
-            stack.append((node, True))
-            for own in reversed(nodes):
-                stack.extend((operand, False) for operand in reversed(own.operands))
     return out

@@ -44,8 +44,8 @@ log = get_logger(__name__)
 # CPU time of compiling n statements, within 40 % of what g++ 12 takes for bundled mechanisms:
 # START_SECONDS + n (STATEMENT_SECONDS + n PAIR_SECONDS).
 START_SECONDS = 0.09
-STATEMENT_SECONDS = 1.4e-4
-PAIR_SECONDS = 1.2e-8
+STATEMENT_SECONDS = 2.2e-4
+PAIR_SECONDS = 8e-9
 STATEMENTS_GUESSED = 120
 """Statements for each coordinate, until they are counted: 60 to 120 in planar chains of loops, 300
 in parallel robots.  Too low a guess costs another generation, too high a one a late compilation."""

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from srm_mbs.integration.generated.algebra import algebra_of
+from srm_mbs.integration.generated.algebra import LARGEST_UNROLLED, algebra_of
 from srm_mbs.integration.generated.frames import shortest_terms
 from srm_mbs.integration.generated.linearisation import linearisation_of
 from srm_mbs.integration.generated.structure import Structure
@@ -43,12 +43,16 @@ def source_of(structure: Structure) -> Source:
         *(structure.held, linear.constant_count),
     )
     text = _TEMPLATE.format(
+        passes=_PASSES,
+        prototypes=PROTOTYPES,
         turns=_TURNS,
         sizes=", ".join(map(str, sizes)),
         constants=written.constants,
         terms=written.terms,
     )
-    text += _algebra(structure, [output.target for output in recorded.outputs]) + linear.text
+    # Algebra with loops needs the passes that unrolled algebra does not.
+    text += linear.text + (_ALL_PASSES if structure.nv > LARGEST_UNROLLED else "")
+    text += _algebra(structure, [output.target for output in recorded.outputs])
     return Source(text, written.operations + linear.operations)
 
 
@@ -63,6 +67,31 @@ def _algebra(structure: Structure, targets: Sequence[str]) -> str:
             jacobian.add((int(places[0]), int(places[1])))
     return algebra_of(structure.nv, structure.rows, structure.rank, mass, jacobian)
 
+
+# Statements without a branch, each computed once, leave nothing to these passes of GCC, which take
+# a quarter of its time, in large mechanisms half.  The pragma, because Clang refuses the flags, and
+# earlier versions of GCC forget those of the command line at it.
+_PASSES = """\
+#if __GNUC__ >= 12 && !defined __clang__
+#pragma GCC push_options
+#pragma GCC optimize ("no-tree-pre,no-code-hoisting,no-tree-pta,no-tree-slsr,no-tree-sink")
+#pragma GCC optimize ("no-dse,no-rerun-cse-after-loop,no-ivopts,no-tree-tail-merge")
+#pragma GCC optimize ("no-tree-loop-distribute-patterns,no-isolate-erroneous-paths-dereference")
+#pragma GCC optimize ("no-ipa-icf,no-ipa-cp,no-ipa-sra,no-ipa-ra,no-ipa-modref")
+#pragma GCC optimize ("no-ipa-pure-const,no-ipa-reference")
+#endif"""
+_ALL_PASSES = """
+#if __GNUC__ >= 12 && !defined __clang__
+#pragma GCC pop_options
+#endif
+"""
+
+# Headers would take longer to read than the terms of a small mechanism.
+PROTOTYPES = """\
+double sqrt(double), fabs(double), copysign(double, double), fmax(double, double);
+double fmin(double, double), sin(double), cos(double), tanh(double);
+void *memcpy(void *, const void *, __SIZE_TYPE__), *memset(void *, int, __SIZE_TYPE__);"""
+"""Functions of C's library that the source calls."""
 
 LARGEST_ANGLE = 1e6
 """Angle (rad) up to which its multiple of pi/2 has the bits that its products leave: 20."""
@@ -123,8 +152,8 @@ _TEMPLATE = """\
  * M: upper triangle, column by column; nle; tau, lawful: forces of elements without and with laws;
  * values, own: laws of elements and of coordinates; g, bias; G[row][column]; B, J: kinematics of
  * the bodies of bushings. */
-#include <math.h>
-#include <string.h>
+{passes}
+{prototypes}
 
 /* Two equal operations at once; their constants are neighbours. */
 typedef double pair __attribute__((vector_size(16)));

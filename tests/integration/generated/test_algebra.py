@@ -13,6 +13,7 @@ from scipy.linalg import qr, solve_triangular
 from srm_mbs._typing import FloatArray
 from srm_mbs.integration.generated.algebra import algebra_of
 from srm_mbs.integration.generated.code_cache import compile_and_load
+from srm_mbs.integration.generated.source import PROTOTYPES
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
@@ -41,7 +42,7 @@ class _Algebra:
         self.rank = int(np.linalg.matrix_rank(self.G))
         mass = {(j, i) for i in range(nv) for j in paths[i]}
         entries = [(int(row), int(i)) for row, i in np.argwhere(self.G[:-1])]
-        source = "#include <math.h>\n" + algebra_of(nv, rows, self.rank, mass, entries)
+        source = PROTOTYPES + algebra_of(nv, rows, self.rank, mass, entries)
         self.library: Any = compile_and_load(source, lambda path: ctypes.CDLL(str(path)))[0]
         size = ctypes.c_size_t.in_dll(self.library, "srm_mbs_factors_size").value
         self._memory = np.zeros(size + 64, dtype=np.uint8)

@@ -1557,9 +1557,10 @@ nb::object py_recorded_dips(const DipSearch& search, const Array& times, const A
     return nb::make_tuple(owned_array(std::move(found.t)), found.dips, found.tops);
 }
 
-// Whether the plain records of a run that ended at `end` (s) have no dips.
+// Whether the plain records of a run that ended at `end` (s) have no dips; false for stiff steps.
 bool without_dips(const DipSearch& search, const PyRecords& records, double end) {
     const StepArrays steps = arrays(records, end);
+    if (std::count(steps.stiff.begin(), steps.stiff.end(), 0) != steps.count) return false;
     const long width = static_cast<long>(records.stages);
     expect_within("columns", search.columns, 0, width - 1);
     return recorded_dips(search, steps.times, steps.sigmas, steps.count, width, end).dips.empty();

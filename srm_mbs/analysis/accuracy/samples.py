@@ -32,27 +32,23 @@ class Samples:
     ----------
     run
         The part at these ends, and where it ends.
-    ends : (k,) s
-        The ends of whole steps: of all but a step that an event ended.
-    between : (n,) s
-        Times between them (:func:`times_between`).
-    between_states : (n, nq + nv)
-        The states there, by dense output.
+    whole
+        Number of ends of whole steps: of all but a step that an event ended.
+    between
+        The part at times between them (:func:`times_between`).
     """
 
     run: SimulationResult
-    ends: FloatArray
-    between: FloatArray
-    between_states: FloatArray
+    whole: int
+    between: SimulationResult
 
 
 def sampled(part: SimulationResult) -> Samples:
     """The samples of a smooth part of a run."""
-    run, between = at_ends(part), times_between(part)
-    ends = run.t
-    if part.steps.stop is not None:  # an event within the last step
-        ends = ends[:-1]
-    return Samples(run, ends, between, part.states(between))
+    run = at_ends(part)
+    # The last one may be an event within the last step.
+    whole = len(run.t) - (part.steps.stop is not None)
+    return Samples(run, whole, part.at(times_between(part)))
 
 
 def at_ends(solution: SimulationResult) -> SimulationResult:
@@ -77,8 +73,12 @@ def sampled_ends(part: SimulationResult) -> IndexArray:
     if steps.corrections.size:
         corrections = np.abs(steps.corrections) / part.mechanism.structure.units.state
         size.flat[:n] = corrections.max(axis=1)
-    chosen = np.arange(0, n, length) + size.argmax(axis=1)
-    return np.unique([0, *(chosen + 1), *(step + 1 for step in steps.between_nodes), n])
+    chosen = np.zeros(n + 1, dtype=bool)
+    chosen[0] = chosen[n] = True
+    chosen[np.arange(1, n + 1, length) + size.argmax(axis=1)] = True
+    if steps.between_nodes:
+        chosen[np.array(steps.between_nodes) + 1] = True
+    return np.flatnonzero(chosen)
 
 
 def sample_times(solution: SimulationResult, *, fixed: bool = False) -> FloatArray:
@@ -106,13 +106,16 @@ def sample_states(
     if others:
         times = sample_times(solution)
         return times, solution.states(times)
-    times = np.concatenate((own.ends, own.between))
+    at_ends, between = own.run.rows, own.between.rows
+    times = np.concatenate((at_ends[0][: own.whole], between[0]))
+    states = np.concatenate((at_ends[1][: own.whole], between[1]))
     order = times.argsort(kind="stable")
-    times = times[order]
-    last = np.append(times[1:] > times[:-1], True)  # of equal ones
-    at_ends = np.concatenate((own.run.q, own.run.v), axis=1)[: len(own.ends)]
-    states = np.concatenate((at_ends, own.between_states))
-    return times[last], states[order[last]]
+    times, states = times[order], states[order]
+    twice = times[1:] == times[:-1]
+    if np.logical_or.reduce(twice):
+        last = np.append(~twice, True)
+        times, states = times[last], states[last]
+    return times, states
 
 
 def times_between(part: SimulationResult) -> FloatArray:
@@ -122,9 +125,11 @@ def times_between(part: SimulationResult) -> FloatArray:
     n = steps.count
     if not n or not len(part.scheme.dense.extra_c):
         return np.linspace(start, end, EVEN_TIMES)
-    lengths = np.diff(steps.times)
+    lengths = steps.times[1:] - steps.times[:-1]
     by_error, by_length, even = (max(fewest, n // of) for fewest, of in READ_STEPS)
-    worst, longest = steps.error_ratios.argsort()[-by_error:], lengths.argsort()[-by_length:]
-    chosen = np.unique([*worst, *longest, *np.linspace(0, n - 1, even).astype(int)])
-    times: FloatArray = (steps.times[chosen, None] + np.outer(lengths[chosen], READ_AT)).ravel()
-    return times[times <= end]
+    chosen = np.zeros(n, dtype=bool)
+    chosen[steps.error_ratios.argsort()[-by_error:]] = True
+    chosen[lengths.argsort()[-by_length:]] = True
+    chosen[:: -(-n // even)] = True
+    times: FloatArray = (steps.times[:-1] + READ_AT[:, None] * lengths)[:, chosen].T.ravel()
+    return times if steps.stop is None else times[times <= end]

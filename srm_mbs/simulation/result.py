@@ -539,7 +539,7 @@ class SimulationResult(RunOutcome):
             return self._dense, self.settings.singular_tolerance
 
         dips = kernel_steps.recorded_dips if self._by_kernel else recorded_dips
-        return find_crossings(self._system, self.scheme, self.steps, monitored, dips)
+        return find_crossings(system, scheme, self.steps, monitored, dips)
 
     @cached_property
     def bifurcations(self) -> tuple[Bifurcation, ...]:

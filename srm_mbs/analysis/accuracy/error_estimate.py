@@ -279,7 +279,8 @@ def estimate_error(
         if apart is not None:  # where takes more times
             times = np.union1d(times, sample_times(solution))
             whole = compare(solution, partner, times, readings)
-            grid, apart = whole_grid if fixed else times, whole.until(DISAGREEMENT)
+            apart = whole.until(DISAGREEMENT) or apart  # of these times and others
+            grid = whole_grid if fixed else times
             kept = compare(solution, partner, times[times < apart], readings)
             grid = grid[grid < apart]
         if least:

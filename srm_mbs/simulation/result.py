@@ -529,10 +529,8 @@ class SimulationResult(RunOutcome):
     @cached_property
     def crossings(self) -> tuple[Crossing, ...]:
         """Passages through singular configurations, in order of time."""
-
-        if self._by_kernel and kernel_steps.without_passages(
-            self._system, self.scheme, self._dense
-        ):
+        system, scheme = self._system, self.scheme
+        if self._by_kernel and kernel_steps.without_passages(system, scheme, self._dense):
             return ()
 
         def monitored() -> tuple[DenseOutput, float]:

@@ -350,11 +350,15 @@ class StepData:
         critical = [step for one in self.critical_ranges for step in range(*one)]
         return sorted({*self.zones, *critical}) if critical else sorted(self.zones)
 
-    def with_stages(self, scheme: ButcherTableau) -> BoolArray:
+    def with_stages(
+        self,
+        scheme: ButcherTableau,
+        close: Callable[[FloatArray, FloatArray], BoolArray] = close_to_singular,
+    ) -> BoolArray:
         """Which steps (n,) are explicit ones of ``scheme`` whose stages lie on the motion, to their
-        order: away from singular configurations."""
+        order: away from singular configurations, of which ``close`` tells."""
         explicit = scheme.member(False)
-        out = ~close_to_singular(explicit.abscissae, self.sigmas)
+        out = ~close(explicit.abscissae, self.sigmas)
         out &= (self.stiff == 0.0) & (explicit.implicit is None)
         out[self.between_nodes] = False
         return out

@@ -21,7 +21,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.observables import LINEAR, Observables, working_elements
@@ -130,6 +130,10 @@ class BalancedRun(Protocol):
         """The accepted steps."""
 
     @property
+    def steps_with_stages(self) -> BoolArray:
+        """Which steps (n,) have stages that lie on the motion."""
+
+    @property
     def observables(self) -> Observables:
         """Quantities at many states of the mechanism."""
 
@@ -172,7 +176,7 @@ class Nodes:
         out = np.full(len(ends) - 1, -1)
         if not (self._smooth and len(self._scheme.dense.extra_c) and steps.count):
             return out
-        with_stages = steps.with_stages(self._run.scheme)
+        with_stages = self._run.steps_with_stages
         if self._run.t_eval is None and steps.stop is None:  # all intervals are steps
             return np.where(with_stages, np.arange(steps.count), out)
         step = np.clip(np.searchsorted(steps.times, ends[:-1]), 0, steps.count - 1)
@@ -308,26 +312,37 @@ def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
     EvaluationError
         If a force cannot be evaluated.
     """
-    ends, energies = solution.t, solution.energies
-    place: IndexArray | slice = slice(None)
-    if solution.t_eval is None:  # the ends of the steps
-        first = energies[:1]
-    else:
-        times, first = solution.steps.times, solution.steps.states[:1]
-        ends = np.unique(np.concatenate([times[times < solution.steps.end], ends]))
-        if times[0] < ends[0]:
-            ends = np.concatenate([times[:1], ends])
-        place = np.searchsorted(ends, solution.t)
-        nq = solution.mechanism.model.nq
-        first = solution.observables.energies(first[:, :nq], first[:, nq:])
-    nodes = Nodes(solution, system, ends)
-    powers = {name: one for term in TERMS for name, one in term(nodes, system).items()}
-    works = {name: work[place] for name, work in nodes.works(powers).items()}
+    t, energies, times = solution.t, solution.energies, solution.steps.times
+    first = energies[:1]
+    if not len(t) or t[0] != times[0]:
+        nq, states = solution.mechanism.model.nq, solution.steps.states[:1]
+        first = solution.observables.energies(states[:, :nq], states[:, nq:])
+    works = _works(solution, system, t) if _acted_on(system) else {}
     start = float(first.sum())
     kinetic, potential = energies.T
     largest = max(abs(start), _largest(kinetic), _largest(kinetic + potential))
     rounding = _rounding(solution.mechanism, largest)
-    return EnergyBalance(solution.t, kinetic, potential, KnownKeys(works), start, rounding)
+    return EnergyBalance(t, kinetic, potential, KnownKeys(works), start, rounding)
+
+
+def _acted_on(system: _System) -> bool:
+    """Whether anything may do work beside the potentials."""
+    mechanism = system.mechanism
+    by_joints = system.controlled or system.is_damped or system.has_friction
+    return by_joints or bool(mechanism.drives or working_elements(mechanism))
+
+
+def _works(solution: BalancedRun, system: _System, t: FloatArray) -> Powers:
+    """The works (n,) J up to the times ``t`` (n,), of which a run without output times has all."""
+    place: IndexArray | slice = slice(None)
+    ends = t
+    if solution.t_eval is not None:  # steps are integrated whole
+        times = solution.steps.times
+        ends = np.unique(np.concatenate([times[:1], times[times < solution.steps.end], t]))
+        place = np.searchsorted(ends, t)
+    nodes = Nodes(solution, system, ends)
+    powers = {name: one for term in TERMS for name, one in term(nodes, system).items()}
+    return {name: work[place] for name, work in nodes.works(powers).items()}
 
 
 def _largest(values: FloatArray) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srm_mbs._kernel import core
-from srm_mbs._typing import FloatArray
+from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.dynamics.constraints.reactions import Reactions
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.mechanism import Mechanism
@@ -29,6 +29,7 @@ from srm_mbs.integration.dense_output import (
     DenseOutput,
     StepData,
     checked_output_times,
+    close_to_singular,
     unwrapped_angles,
 )
 from srm_mbs.integration.driver import RunStatus
@@ -332,6 +333,11 @@ class SimulationResult(RunOutcome):
         return self._nodes[1][:, self.mechanism.model.nq :]
 
     @property
+    def rows(self) -> tuple[FloatArray, FloatArray]:
+        """``t`` (n,) s, and q and v (n, nq + nv) there."""
+        return self._nodes
+
+    @property
     def last_state(self) -> FloatArray:
         """q and v (nq + nv,) in the last row."""
         last: FloatArray = self._nodes[1][-1]
@@ -523,12 +529,15 @@ class SimulationResult(RunOutcome):
     @cached_property
     def crossings(self) -> tuple[Crossing, ...]:
         """Passages through singular configurations, in order of time."""
+        system, scheme = self._system, self.scheme
+        if self._by_kernel and kernel_steps.without_passages(system, scheme, self._dense):
+            return ()
 
         def monitored() -> tuple[DenseOutput, float]:
             return self._dense, self.settings.singular_tolerance
 
         dips = kernel_steps.recorded_dips if self._by_kernel else recorded_dips
-        return find_crossings(self._system, self.scheme, self.steps, monitored, dips)
+        return find_crossings(system, scheme, self.steps, monitored, dips)
 
     @cached_property
     def bifurcations(self) -> tuple[Bifurcation, ...]:
@@ -609,6 +618,13 @@ class SimulationResult(RunOutcome):
             ),
         }
         return PointMotion(lambda which: readers[which]())
+
+    @property
+    def steps_with_stages(self) -> BoolArray:
+        """Which steps (n,) have stages that lie on the motion, to their order
+        (:meth:`~srm_mbs.integration.dense_output.StepData.with_stages`)."""
+        close = kernel_steps.close_to_singular if self._by_kernel else close_to_singular
+        return self.steps.with_stages(self.scheme, close)
 
     @cached_property
     def energy_balance(self) -> EnergyBalance:

@@ -110,8 +110,13 @@ bool DenseOutput::close_to_singular(long step) const {
     if (last - first < 2) return false;  // without neighbours there is no polynomial
     if (steps_.in_zone[step]) return true;
     const std::vector<double>& abscissae = scheme_of(step).abscissae;
+    return srm::close_to_singular(abscissae, steps_.sigmas + step * abscissae.size(),
+                                  constants_.close, constants_.branch_below);
+}
+
+bool close_to_singular(const std::vector<double>& abscissae, const double* sigmas, double close,
+                       double branch_below) {
     const int width = static_cast<int>(abscissae.size());
-    const double* sigmas = steps_.sigmas + step * width;
     if (!finite(sigmas, width)) return false;
     double change = 0.0, lowest = sigmas[0];
     for (int j = 1; j < width; ++j) {
@@ -119,7 +124,7 @@ bool DenseOutput::close_to_singular(long step) const {
             change = std::max(change, std::abs(sigmas[j] - sigmas[0]) / abscissae[j]);
         lowest = std::min(lowest, sigmas[j]);
     }
-    return lowest < std::max(constants_.close * change, constants_.branch_below);
+    return lowest < std::max(close * change, branch_below);
 }
 
 void Extension::weights(double theta, double* out) const {

@@ -43,6 +43,11 @@ struct DenseConstants {
     void check() const;
 };
 
+// Whether stages of a step, with sigma (abscissae,), lie close to a singular configuration:
+// close_to_singular() of dense_output.py.
+bool close_to_singular(const std::vector<double>& abscissae, const double* sigmas, double close,
+                       double branch_below);
+
 // The accepted steps, as arrays that the caller keeps alive.
 struct StepArrays {
     long count = 0;

@@ -469,6 +469,23 @@ void bushing_turns(const std::vector<ForceElement>& elements,
 
 double spring_damper_power(const ForceElement& e, double coincident,
                            const pinocchio_model::Workspace& work) {
+    if (e.stiffness == 0.0) {  // a damper alone: its force is along the line that joins the points
+        const pinocchio::Data& data = work.data;
+        const Vector3d at_a = origin(e.a, data), at_b = origin(e.b, data), apart = at_a - at_b;
+        const double square = apart.squaredNorm(), closest = coincident * e.rest;
+        if (square < closest * closest) throw EvaluationError{Failure::coincident};
+        Vector3d rate = Vector3d::Zero();
+        const auto add_rate = [&](const Anchor& anchor, double sign) {  // in axes of the body
+            if (!anchor.joint) return;
+            const Eigen::Map<const Vector3d> inside(anchor.placement.data() + 9);
+            const Vector3d own = point_velocity(data.v[anchor.joint], inside);
+            rate += sign * (data.oMi[anchor.joint].rotation() * own);
+        };
+        add_rate(e.a, 1.0);
+        add_rate(e.b, -1.0);
+        const double along = apart.dot(rate);
+        return -e.damping * (square != 0.0 ? along * along / square : rate.squaredNorm());
+    }
     SpringDamper found(e, coincident, work.data);
     const Vector3d rate = found.rate(e, work.data);
     if (e.damping != 0.0) found.damp(e, rate);

@@ -1565,8 +1565,31 @@ nb::object py_recorded_dips(const DipSearch& search, const Array& times, const A
     return nb::make_tuple(owned_array(std::move(found.t)), found.dips, found.tops);
 }
 
+// Whether the plain records of a run that ended at `end` (s) have no dips; false for stiff steps.
+bool without_dips(const DipSearch& search, const PyRecords& records, double end) {
+    const StepArrays steps = arrays(records, end);
+    if (std::count(steps.stiff.begin(), steps.stiff.end(), 0) != steps.count) return false;
+    const long width = static_cast<long>(records.stages);
+    expect_within("columns", search.columns, 0, width - 1);
+    return recorded_dips(search, steps.times, steps.sigmas, steps.count, width, end).dips.empty();
+}
+
+// Of each step with sigma (n, abscissae) whether its stages lie close to a singular configuration.
+std::vector<bool> py_close_to_singular(const std::vector<double>& abscissae, const Array& sigmas,
+                                       const DenseConstants& constants) {
+    if (sigmas.ndim() != 2 || sigmas.shape(1) != abscissae.size())
+        throw nb::value_error("sigmas has another shape");
+    std::vector<bool> out(sigmas.shape(0));
+    for (std::size_t i = 0; i < out.size(); ++i)
+        out[i] = close_to_singular(abscissae, sigmas.data() + i * abscissae.size(),
+                                   constants.close, constants.branch_below);
+    return out;
+}
+
 void bind_dense_output(nb::module_& m) {
     m.def("recorded_dips", &py_recorded_dips);
+    m.def("without_dips", &without_dips);
+    m.def("close_to_singular", &py_close_to_singular);
     bind_struct<PySteps>(m, "StepArrays");
     m.def("largest_norms", &largest_norms, nb::arg("x"), nb::arg("order"), nb::arg("starts"));
     nb::class_<PyDense>(m, "DenseOutput")

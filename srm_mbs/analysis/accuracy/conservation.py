@@ -24,9 +24,9 @@ class Drift:
     unit
         ``m`` or ``rad``.
     position, rate
-        Norms over all rows of g, in ``unit``, and of G v, in ``unit``/s, at the ends of steps.
+        Norms over all rows of g, in ``unit``, and of G v, in ``unit``/s, at ends of steps.
     between_position, between_rate
-        The same, also with the dense output at evenly spaced times between them.
+        The same, also with the dense output at times between them.
     relative
         ``position`` over the scene diagonal, or 1 rad.
     """
@@ -101,14 +101,13 @@ def drift_of(samples: Sequence[Samples]) -> tuple[Drift, ...]:
     """
     found: dict[str, list[list[float]]] = {}
     for part in samples:
-        run, nq = part.run, part.run.mechanism.model.nq
+        run, between = part.run, part.between
         if not run.mechanism.constrained:
             continue
         rows, norms = _rows_by_unit(run.mechanism), run.observables.largest_norms
-        q, v = part.even_states[:, :nq], part.even_states[:, nq:]
-        between = run.observables.closure_errors(part.even, q, v)
-        at_ends = [errors[: len(part.ends)] for errors in run.invariants[:2]]
-        sizes = [norms(errors, rows.order, rows.starts) for errors in (*at_ends, *between)]
+        at_ends = [errors[: part.whole] for errors in run.invariants[:2]]
+        within = run.observables.closure_errors(between.t, between.q, between.v)
+        sizes = [norms(errors, rows.order, rows.starts) for errors in (*at_ends, *within)]
         for (unit, scale), (*largest, position, rate) in zip(rows.units, zip(*sizes)):
             more = np.maximum(largest, (position, rate))
             found.setdefault(unit, []).append([*largest, *more, scale])

@@ -276,9 +276,13 @@ def estimate_error(
         readings.allowed = least
         kept = whole = compare(solution, partner, times, readings)
         grid, apart = whole_grid, whole.until(DISAGREEMENT)
-        if apart is not None:
+        if apart is not None:  # where takes more times
+            times = np.union1d(times, sample_times(solution))
+            whole = compare(solution, partner, times, readings)
+            apart = whole.until(DISAGREEMENT) or apart  # of these times and others
+            grid = whole_grid if fixed else times
             kept = compare(solution, partner, times[times < apart], readings)
-            grid = whole_grid[whole_grid < apart]
+            grid = grid[grid < apart]
         if least:
             readings.allowed = max(least, part * kept.largest)
         differences = [

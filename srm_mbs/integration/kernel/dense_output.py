@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._kernel import core
-from srm_mbs._typing import FloatArray
+from srm_mbs._typing import BoolArray, FloatArray
+from srm_mbs.dynamics.constraints.structure import SMALL_REFERENCE_PIVOT
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.integration import singular_passages
 from srm_mbs.integration.dense_output import DenseOutput, StepData
@@ -69,7 +70,7 @@ class CompiledDenseOutput(DenseOutput):
     ) -> None:
         super().__init__(system, scheme, steps, end_state)
         self._made_by = made_by
-        self._recorded = recorded
+        self.recorded = recorded
         self._mechanism_system = system
         self.kernel_system = kernel_system
 
@@ -127,7 +128,7 @@ class CompiledDenseOutput(DenseOutput):
     @cached_property
     def _by_reference(self) -> bool:
         """Whether only the reference can evaluate it."""
-        if self._recorded is not None:
+        if self.recorded is not None:
             return False
         steps, extension = self._steps, self._scheme.dense
         if not steps.count:
@@ -145,8 +146,8 @@ class CompiledDenseOutput(DenseOutput):
     def _compiled(self) -> Any:
         system, schemes = self._mechanism_system, marshalling.scheme_denses(self._scheme)
         constants = marshalling.dense_constants()
-        if self._recorded is not None:
-            return core.DenseOutput(schemes, constants, *self._recorded)  # type: ignore[union-attr]
+        if self.recorded is not None:
+            return core.DenseOutput(schemes, constants, *self.recorded)  # type: ignore[union-attr]
         steps = marshalling.steps_struct(self._steps)
         return core.DenseOutput(system.nq, system.nv, schemes, constants, steps)  # type: ignore[union-attr]
 
@@ -177,3 +178,24 @@ def recorded_dips(scheme: ButcherTableau, steps: StepData) -> RecordedDips | Non
         _dip_search(scheme), steps.times, steps.sigmas, steps.end
     )
     return found
+
+
+def without_passages(
+    system: ClosedSystem | OpenSystem, scheme: ButcherTableau, dense: DenseOutput
+) -> bool:
+    """Whether records of the kernel show, before they are arrays, that a run away from singular
+    configurations has nothing that
+    :func:`~srm_mbs.integration.singular_passages.find_crossings` looks for."""
+    if not isinstance(dense, CompiledDenseOutput) or dense.recorded is None:
+        return False
+    analysis = system.singularities
+    if analysis is None:
+        return True
+    followed = analysis.sigma_reference < SMALL_REFERENCE_PIVOT
+    return not followed and core.without_dips(_dip_search(scheme), *dense.recorded)  # type: ignore
+
+
+def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> BoolArray:
+    """As :func:`srm_mbs.integration.dense_output.close_to_singular`, of sigmas (n, s + 1)."""
+    constants = marshalling.dense_constants()
+    return np.array(core.close_to_singular(abscissae.tolist(), sigmas, constants))  # type: ignore

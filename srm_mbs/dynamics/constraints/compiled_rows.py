@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel import core
-from srm_mbs._kernel.workspace import LARGE, workspace
+from srm_mbs._kernel.workspace import LARGE, take_idle, workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rheonomic import unscaled_rows
 from srm_mbs.dynamics.constraints.row_algebra import CompiledAlgebra, RowAlgebra
@@ -123,10 +123,7 @@ class ClosureRows:
         idle = self.idle
         if idle is None:
             return None
-        try:
-            kernel_system = idle.pop()  # two threads never get the same
-        except IndexError:
-            kernel_system = core.System(self._model, self._fields, None)  # type: ignore[union-attr]
+        kernel_system = take_idle(idle) or core.System(self._model, self._fields, None)  # type: ignore[union-attr]
         try:
             return getattr(kernel_system, name)(*arguments)
         except ArithmeticError:

@@ -9,11 +9,13 @@ Run from a checkout; BLAS runs on one thread.  Initial speeds of a four-bar are 
 runs and long ones; with `--short` those of the slider-crank, with runs of 1 s; or, with
 `--variants`, the crank of Klann's walker: each case makes a variant of the mechanism, simulates
 2 s, and measures the reactions of all its joints.  Every executor has to give the rows of the
-serial sweep, to the last bit; of variants, Dask with processes is among them, after the others: its
-scheduler, in this process, and its workers take a tenth of two cores while they wait.  Workers have
-been started, and have run, before the clock is.  The repeats go through all executors in turn, and
-the best of each counts; `--seconds` is about what one takes serially.  CPU time over wall time, of
-this process, says on a busy machine whether threads run beside each other.
+serial sweep, to the last bit.  Of variants, Dask with processes is among them, with the settings of
+docs/sweeps.md under which it watches itself less: by default its scheduler, in this process, and
+its workers take a tenth of two cores, busy or idle.  It comes after the others, beside which it
+does not run, in turn with serial sweeps of its own.  Workers have been started, and have run,
+before the clock is.  The repeats go through all executors in turn, and the best of each counts;
+`--seconds` is about what one takes serially.  CPU time over wall time, of this process, says on a
+busy machine whether threads run beside each other.
 """
 
 from __future__ import annotations
@@ -46,6 +48,13 @@ VARIANT_END = 2.0
 """End of the runs of variants, s."""
 CRANKS = (0.262, 0.274)
 """Least and largest crank (m) of the variants of Klann's walker, whose own is 0.268."""
+WATCHING_LESS = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "5s",
+    "distributed.worker.memory.monitor-interval": "2s",
+}
+"""Settings of Dask, for a scheduler that shares the cores with the workers: docs/sweeps.md."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +115,12 @@ def same(sweep: srm.Sweep, reference: srm.Sweep) -> bool:
 
 Measured = tuple[str, int, int | None, Executor | None]
 """Name, workers, chunk (None: adaptive) and executor of a row."""
+SERIAL: Measured = ("serial", 1, 1, None)
 
 
 def executors(stack: ExitStack, workers: list[int]) -> list[Measured]:
     """The rows of sweeps over starts."""
-    out: list[Measured] = [("serial", 1, 1, None)]
+    out: list[Measured] = [SERIAL]
     for count in workers:
         threads = stack.enter_context(ThreadPoolExecutor(count))
         out.append(("threads", count, None, threads))
@@ -129,8 +139,10 @@ def timed(run: Callable[[], srm.Sweep]) -> tuple[float, float, srm.Sweep]:
 
 def with_dask(stack: ExitStack, workers: int) -> Executor:
     """Worker processes of Dask, of one thread each."""
+    import dask
     from distributed import Client, LocalCluster
 
+    stack.enter_context(dask.config.set(WATCHING_LESS))
     cluster = stack.enter_context(
         LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None
@@ -158,13 +170,13 @@ def measure_variants(count: int, repeats: int, workers: list[int], backend: str)
 
     reference = run(None, 1)
 
-    def measured(rows: list[Measured], serial: float | None = None) -> list[Row]:
+    def measured(rows: list[Measured]) -> list[Row]:
         for *_, chunk, executor in rows:
             run(executor, chunk, cranks[:WARM_UP])
-        return best_of(rows, VARIANT_END, count, repeats, reference, run, serial)
+        return best_of(rows, VARIANT_END, count, repeats, reference, run)
 
     with ExitStack() as stack:
-        rows: list[Measured] = [("serial", 1, 1, None)]
+        rows: list[Measured] = [SERIAL]
         for number in workers:
             threads = stack.enter_context(ThreadPoolExecutor(number))
             processes = ProcessPoolExecutor(number, mp_context=get_context("spawn"))
@@ -175,8 +187,7 @@ def measure_variants(count: int, repeats: int, workers: list[int], backend: str)
         found = measured(rows)
     for number in workers:
         with ExitStack() as stack:
-            dask: Measured = ("dask", number, None, with_dask(stack, number))
-            found += measured([dask], count / found[0].runs_per_second)
+            found += measured([SERIAL, ("dask", number, None, with_dask(stack, number))])
     return found
 
 
@@ -187,10 +198,9 @@ def best_of(
     repeats: int,
     reference: srm.Sweep,
     run: Callable[[Executor | None, int | None], srm.Sweep],
-    serial: float | None = None,
 ) -> list[Row]:
     """The best of the ``repeats`` of each executor, in turn, all with the rows of the reference;
-    ``serial`` is the time (s) of the serial sweep, if it is not the first row."""
+    the first is the serial sweep."""
     best = [(np.inf, 0.0)] * len(rows)
     for _ in range(repeats):
         for k, (name, _, chunk, executor) in enumerate(rows):
@@ -198,7 +208,7 @@ def best_of(
             if not same(sweep, reference):
                 raise SystemExit(f"{name}: the rows differ from those of the serial sweep")
             best[k] = min(best[k], (took, cpu / took))
-    serial = serial or best[0][0]
+    serial = best[0][0]
     return [
         Row(
             t_end,

@@ -1,4 +1,5 @@
-"""Pinocchio's workspaces, without its second derivatives where those would fill the memory.
+"""Pinocchio's workspaces, without its second derivatives where those would fill the memory; pools
+of idle ones.
 
 A ``pin.Data`` holds second derivatives of the dynamics, 4 nv^3 numbers: 8 GB at 640 coordinates.
 Nothing here uses them.
@@ -7,12 +8,28 @@ Nothing here uses them.
 from __future__ import annotations
 
 import threading
-from typing import NamedTuple
+from collections import deque
+from typing import NamedTuple, TypeVar
 
 import pinocchio as pin
 
 LARGE = 64
 """Coordinates from which the kernel makes the workspaces: Pinocchio's own have 8 MB there."""
+
+
+Pooled = TypeVar("Pooled")
+
+
+def take_idle(pool: deque[Pooled]) -> Pooled | None:
+    """One of ``pool``, which no other thread gets; None if it is empty.
+
+    Its user appends it afterwards.  What was used last is taken first, and a deque of limited
+    length drops what has waited longest.
+    """
+    try:
+        return pool.pop()
+    except IndexError:  # another thread may take the last one after any look at the length
+        return None
 
 
 def workspace(model: pin.Model) -> pin.Data:

@@ -7,7 +7,7 @@ from collections import deque
 from typing import Any
 
 from srm_mbs._kernel import core
-from srm_mbs._kernel.workspace import LARGE
+from srm_mbs._kernel.workspace import LARGE, take_idle
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
@@ -99,10 +99,7 @@ def impact(
             f"normal has shape {n.shape}, not {v.shape}", element="normal", remedy=remedy
         )
     idle = _idle_systems(mechanism)
-    try:
-        system = idle.pop()  # two threads never get the same
-    except IndexError:
-        system = _make_system(mechanism)
+    system = take_idle(idle) or _make_system(mechanism)
     used = system
     if isinstance(system, Evaluator) and backend() == "python":
         used = system.system

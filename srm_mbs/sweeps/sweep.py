@@ -12,6 +12,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, NamedTuple
+from uuid import uuid4
 
 from srm_mbs.api import simulate
 from srm_mbs.dynamics.mechanism import Mechanism
@@ -299,8 +300,9 @@ def _finished(
         while True:
             while len(running) < waiting.most_pending and (part := waiting.next_chunk()):
                 parameters = [case.parameters for case in part]
+                call = uuid4().hex
                 try:
-                    future = executor.submit(run_chunk, sent, parameters, waiting.time_limit)
+                    future = executor.submit(run_chunk, sent, parameters, waiting.time_limit, call)
                 except Exception as error:  # its workers have died, or it was shut down
                     yield from ((case, raised(error)) for case in part)
                 else:

@@ -239,11 +239,16 @@ class Ran(NamedTuple):
 
 
 def run_chunk(
-    task: Task | bytes, chunk: Sequence[Mapping[str, Any]], time_limit: float = math.inf
+    task: Task | bytes,
+    chunk: Sequence[Mapping[str, Any]],
+    time_limit: float = math.inf,
+    call: str = "",
 ) -> Ran:
     """Run several cases one after the other; this function is submitted to executors.
 
-    No case begins once ``time_limit`` (s) has passed since the first did.
+    No case begins once ``time_limit`` (s) has passed since the first did.  ``call`` names this call
+    and no other: Dask runs calls with equal arguments once, and equal cases may differ in what the
+    user's functions draw at random.
     """
     known = _unpacked(task) if isinstance(task, bytes) else task
     begin = time.perf_counter()

@@ -20,6 +20,11 @@ def states(solution: srm.Solution) -> dict[str, Any]:
     return {**q, **v, "steps": solution.stats.steps, "process": os.getpid()}
 
 
+def drawn(solution: srm.Solution) -> dict[str, Any]:
+    """A number drawn at random."""
+    return {"number": os.urandom(8).hex()}
+
+
 def pendulum(mass: float = 1.0, length: float = 1.0, angle: float = 0.3) -> srm.Mechanism:
     """A point mass on a rod that swings in the vertical plane; ``angle`` from hanging, rad."""
     if length <= 0.0:

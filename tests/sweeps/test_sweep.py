@@ -27,7 +27,7 @@ from benchmarks import sweep_throughput as throughput
 from srm_mbs.sweeps.fingerprint import fingerprint
 from srm_mbs.sweeps.tasks import Outcome, Ran
 from tests.support.snapshots import check_messages, check_refusals, refused
-from tests.support.sweeping import deadly, dying_once, lowest, pendulum, period, states
+from tests.support.sweeping import deadly, drawn, dying_once, lowest, pendulum, period, states
 
 COUNT = 5
 SPEEDS = np.linspace(0.5, 2.5, COUNT)
@@ -190,7 +190,9 @@ def test_chunks_take_a_second_with_executors_of_other_packages(
     class Reporting(kind):  # type: ignore[misc, valid-type]
         """Reports at once that each case took 1/64 s, and runs none."""
 
-        def submit(self, fn: Any, task: Any, chunk: Any, time_limit: float) -> Future[Ran]:  # type: ignore[override]
+        def submit(  # type: ignore[override]
+            self, fn: Any, task: Any, chunk: Any, time_limit: float, call: str
+        ) -> Future[Ran]:
             sent.append((len(chunk), time_limit))
             future: Future[Ran] = Future()
             outcomes = [Outcome(True, "finished", "", {})] * len(chunk)
@@ -201,6 +203,30 @@ def test_chunks_take_a_second_with_executors_of_other_packages(
     assert max(length for length, _ in sent) == longest
     assert sent[-2][0] == last  # the last has what is left
     assert {limit for _, limit in sent} == {2.0 * seconds}
+
+
+class RunningEqualCallsOnce(Executor):
+    """Keeps results by the arguments of their calls, as Dask does while anyone has them."""
+
+    def __init__(self) -> None:
+        self._known: dict[bytes, Any] = {}
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        key = pickle.dumps((args, kwargs))
+        if key not in self._known:
+            self._known[key] = fn(*args, **kwargs)
+        future: Future[Any] = Future()
+        future.set_result(self._known[key])
+        return future
+
+
+def test_equal_cases_are_all_run_by_executors_that_run_equal_calls_once() -> None:
+    executor, cases = RunningEqualCallsOnce(), {"v0": np.zeros((6, 1))}
+    sweeps = [
+        srm.sweep(pendulum(), cases, 0.01, measure=drawn, executor=executor, chunk=2)
+        for _ in range(2)
+    ]
+    assert len({number for sweep in sweeps for number in sweep.table["number"]}) == 12
 
 
 def test_rows_keep_the_order_of_the_cases_whatever_finishes_first() -> None:

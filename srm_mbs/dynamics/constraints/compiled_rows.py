@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel import core
-from srm_mbs._kernel.workspace import workspace
+from srm_mbs._kernel.workspace import take_idle, workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rheonomic import unscaled_rows
 from srm_mbs.dynamics.constraints.row_algebra import CompiledAlgebra, RowAlgebra
@@ -119,11 +119,11 @@ class ClosureRows:
         meanwhile; None without the kernel, and where something cannot be evaluated."""
         if self.idle is None:
             return None
-        try:
-            kernel_system = self.idle.pop()  # two threads never get the same
-            kernel_system.move(self._model, self._given.origins)
-        except IndexError:
+        kernel_system = take_idle(self.idle)
+        if kernel_system is None:
             kernel_system = self._made()
+        else:
+            kernel_system.move(self._model, self._given.origins)
         try:
             return getattr(kernel_system, name)(*arguments)
         except ArithmeticError:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs._kernel.workspace import LARGE, workspace
+from srm_mbs._kernel.workspace import LARGE, take_idle, workspace
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.dynamics.constraints.rows import Elimination, LoopKinematics
 from srm_mbs.model.closures import LoopClosure
@@ -169,10 +169,7 @@ def constraint_errors(
         Times (s) and states.
     """
     model, idle = mechanism.model, _idle_rows(mechanism)
-    try:
-        rows, data = idle.pop()  # two threads never get the same
-    except IndexError:
-        rows, data = unscaled_rows(mechanism).copy_workspace(), workspace(model)
+    rows, data = take_idle(idle) or (unscaled_rows(mechanism).copy_workspace(), workspace(model))
     found = rows.follow(mechanism.drive_curves).errors(model, data, t, q, v)
     if model.nv <= LARGE:
         idle.append((rows, data))

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs._kernel.workspace import workspace
+from srm_mbs._kernel.workspace import take_idle, workspace
 from srm_mbs._typing import BoolArray, FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.compiled_rows import CompiledSampler, Limits, compiled_rows
 from srm_mbs.dynamics.constraints.newton import newton
@@ -164,14 +164,14 @@ class ManifoldSampler:
         self._idle = _idle_algebras(mechanism).setdefault(
             pattern.tobytes(), deque(maxlen=KEPT_ALGEBRAS)
         )
-        try:
-            self._algebras = self._idle.pop()  # two threads never get the same
-        except IndexError:
+        algebras = take_idle(self._idle)
+        if algebras is None:
             of_all = row_algebra(pattern, parents)
             own, driven = pattern[: self.closed], self.closed < len(self.scale)
             of_loops = row_algebra(own, parents) if driven else of_all
-            self._algebras = SamplerAlgebras(of_all, of_loops, row_algebra(own))
-        self._all, self._loops, self._in_units = self._algebras
+            algebras = SamplerAlgebras(of_all, of_loops, row_algebra(own))
+        self._algebras = algebras
+        self._all, self._loops, self._in_units = algebras
         self._factorised: FloatArray | None = None
 
     def end(self) -> None:

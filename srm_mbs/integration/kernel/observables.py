@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._kernel import core
-from srm_mbs._kernel.workspace import LARGE
+from srm_mbs._kernel.workspace import LARGE, take_idle
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.compiled_rows import compiled_rows
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
@@ -77,12 +77,12 @@ class _Lent:
         self._idle, self._mechanism, self._system = idle, mechanism, system
 
     def __enter__(self) -> Any:
-        try:
-            self._kernel_system = self._idle.pop()  # two threads never get the same
-            mechanism = self._mechanism
+        mechanism = self._mechanism
+        self._kernel_system = take_idle(self._idle)
+        if self._kernel_system is None:
+            self._kernel_system = _make_all_rows(self._system or make_system(mechanism))
+        else:
             self._kernel_system.move(mechanism.model, unscaled_rows(mechanism).origins)
-        except IndexError:
-            self._kernel_system = _make_all_rows(self._system or make_system(self._mechanism))
         return self._kernel_system
 
     def __exit__(self, *_: object) -> None:

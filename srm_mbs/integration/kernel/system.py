@@ -10,6 +10,7 @@ from typing import Any, Self, cast
 import numpy as np
 
 from srm_mbs._kernel import core
+from srm_mbs._kernel.workspace import take_idle
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.rows import KEPT_SYSTEMS
 from srm_mbs.dynamics.constraints.structure import rows_in_use, structure_of
@@ -139,11 +140,8 @@ class SuccessiveWorkspaces:
 
 
 def _idle_or_new(pool: deque[Any] | None, system: ClosedSystem | OpenSystem, code: Any) -> Any:
-    if not pool:
-        return make_kernel_system(system, code)
-    try:
-        kernel_system = pool.pop()  # deque: two threads never get the same
-    except IndexError:  # the other one took the last
+    kernel_system = None if pool is None else take_idle(pool)
+    if kernel_system is None:
         return make_kernel_system(system, code)
     kernel_system.move(system.model, system.origins)
     kernel_system.renew(**system.constants_of_start())

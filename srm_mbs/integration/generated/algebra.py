@@ -313,7 +313,7 @@ static ALWAYS_INLINE int next_column(Factors *w, int k, vec *squares, vec *limit
   const double *const square = (const double *)squares, *const limit = (const double *)limits;
   double most = -1.0;
   int best = k;
-  for (int n = k; n < ROWS; ++n) {
+  _Pragma(UNROLLED) for (int n = k; n < ROWS; ++n) {
     const int j = w->order[n];
     if (square[j] < limit[j]) square_again(w, j, squares, limits, active);
     if (square[j] > most) most = square[j], best = n;

@@ -23,7 +23,7 @@ from PIL import Image, ImageSequence
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import closure_errors
 from srm_mbs.formats.toml.description import check_description, parse_toml
-from srm_mbs.formats.toml.parameters import resolved
+from srm_mbs.formats.toml.parameters import Resolved
 from tools import closure_sketches, plot_pictures, singular_pictures, tutorials
 from tools.method_tables import filled
 from tools.pages import DOCS, PRINTS, ROOT, blocks, is_whole, run_page, with_printed
@@ -99,7 +99,7 @@ def fragments() -> list[tuple[str, str]]:
 @pytest.mark.parametrize(("page", "text"), fragments())
 def test_the_tables_of_descriptions_on_a_page_are_valid(page: str, text: str) -> None:
     entries = parse_toml('format = 1\nurdf = "x.urdf"\n' + text, page)
-    description = check_description(resolved(entries, {}, page)[0], page)
+    description = check_description(Resolved(entries, {}, page).entries, page)
     kinds = (description.loop, description.drive, description.force, description.override)
     assert sum(map(len, kinds)) == text.count("[[")
 

@@ -333,11 +333,6 @@ class SimulationResult(RunOutcome):
         return self._nodes[1][:, self.mechanism.model.nq :]
 
     @property
-    def rows(self) -> tuple[FloatArray, FloatArray]:
-        """``t`` (n,) s, and q and v (n, nq + nv) there."""
-        return self._nodes
-
-    @property
     def last_state(self) -> FloatArray:
         """q and v (nq + nv,) in the last row."""
         last: FloatArray = self._nodes[1][-1]

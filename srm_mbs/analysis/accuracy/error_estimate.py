@@ -276,10 +276,10 @@ def estimate_error(
         readings.allowed = least
         kept = whole = compare(solution, partner, times, readings)
         grid, apart = whole_grid, whole.until(DISAGREEMENT)
-        if apart is not None:  # where takes more times
+        if apart is not None:  # more times tell from when on they disagree
             times = np.union1d(times, sample_times(solution))
             whole = compare(solution, partner, times, readings)
-            apart = whole.until(DISAGREEMENT) or apart  # of these times and others
+            apart = whole.until(DISAGREEMENT) or apart
             grid = whole_grid if fixed else times
             kept = compare(solution, partner, times[times < apart], readings)
             grid = grid[grid < apart]

@@ -106,9 +106,10 @@ def sample_states(
     if others:
         times = sample_times(solution)
         return times, solution.states(times)
-    at_ends, between = own.run.rows, own.between.rows
-    times = np.concatenate((at_ends[0][: own.whole], between[0]))
-    states = np.concatenate((at_ends[1][: own.whole], between[1]))
+    run, between, whole = own.run, own.between, own.whole
+    times = np.concatenate((run.t[:whole], between.t))
+    q, v = np.concatenate((run.q[:whole], between.q)), np.concatenate((run.v[:whole], between.v))
+    states = np.hstack((q, v))
     order = times.argsort(kind="stable")
     times, states = times[order], states[order]
     twice = times[1:] == times[:-1]

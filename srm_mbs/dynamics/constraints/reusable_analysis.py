@@ -89,12 +89,12 @@ class ReusableAnalysis:
         if any(loop.rows is not own.rows for loop, own in zip(loops, self.loops)):
             return
         origins = [
-            known.origin_of(anchor, carrier)
+            first.origin_of(anchor, carrier)
             for loop, own, carriers in zip(loops, self.loops, self.carriers)
-            for known, anchor, carrier in zip(own.anchors, loop.anchors, carriers)
+            for first, anchor, carrier in zip(own.anchors, loop.anchors, carriers)
         ]
-        known = [origin for origin in origins if origin is not None]
-        rows = self.rows.moved(loops, known) if len(known) == len(origins) else None
+        found = [origin for origin in origins if origin is not None]
+        rows = self.rows.moved(loops, found) if len(found) == len(origins) else None
         if rows is not None:
             unscaled_rows.keep(mechanism, rows)
             anchor_points.keep(mechanism, rows.anchors())

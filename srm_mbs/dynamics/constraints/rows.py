@@ -509,7 +509,7 @@ class LoopKinematics:
         joints, and with the same idle kernel systems; None unless all are between anchors and have
         rows.
 
-        As of these rows, only copies of their workspace may be evaluated.
+        They share the workspace: evaluate a copy of it (:meth:`copy_workspace`).
         """
         if self._joint_rows or len(loops) != len(self._loops):
             return None

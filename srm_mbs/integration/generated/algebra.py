@@ -26,11 +26,11 @@ the kernel's sparse algebra costs less."""
 
 
 TAKEN = 8
-"""Rows of G up to which vectors are put together of its entries, without a way through memory."""
+"""Rows of G up to which the vectors of G^T are made of its entries without X in between."""
 LARGEST_UNROLLED = 8
 """Coordinates up to which there are no loops over them, and nothing is skipped but what is zero
-beforehand.  The factorisation is then written statement by statement: a compiler that unrolls loops
-takes a third more time."""
+beforehand.  The factorisation is then written statement by statement: a compiler that has to unroll
+loops takes longer."""
 
 
 def algebra_of(
@@ -228,30 +228,6 @@ typedef __UINT64_TYPE__ uint64_t;
 typedef double vec __attribute__((vector_size(8 * LANES)));
 typedef long long flags __attribute__((vector_size(8 * LANES)));
 #define WIDE ((ROWS + LANES - 1) / LANES)
-#if WIDE == 1
-#define EACH_VECTOR BODY(0)
-#elif WIDE == 2
-#define EACH_VECTOR BODY(0) BODY(1)
-#elif WIDE == 3
-#define EACH_VECTOR BODY(0) BODY(1) BODY(2)
-#elif WIDE == 4
-#define EACH_VECTOR BODY(0) BODY(1) BODY(2) BODY(3)
-#else
-#define EACH_VECTOR EACH(b, WIDE) BODY(b)
-#endif
-/* The vector b of a row of X, of which all entries are given. */
-#define TAKE(b, ...) TAKE_##b(__VA_ARGS__)
-#if LANES == 8
-#define TAKE_0(...) (vec){__VA_ARGS__}
-#elif LANES == 4
-#define TAKE_0(p, q, r, s, ...) (vec){p, q, r, s}
-#define TAKE_1(p, q, r, s, ...) (vec){__VA_ARGS__}
-#else
-#define TAKE_0(p, q, ...) (vec){p, q}
-#define TAKE_1(p, q, r, s, ...) (vec){r, s}
-#define TAKE_2(p, q, r, s, t, u, ...) (vec){t, u}
-#define TAKE_3(p, q, r, s, t, u, v, w) (vec){v, w}
-#endif
 enum { HIGH = (N + LANES - 1) / LANES, SHORT = @SHORT@ };
 #define EACH(b, count) _Pragma("GCC unroll 16") for (int b = 0; b < count; ++b)
 #define UNROLL(i, first, count) _Pragma("GCC unroll 8") for (int i = first; i < count; ++i)
@@ -446,7 +422,31 @@ _LOOPS = """\
 _UNROLLED_LOOPS = """\
 #define UNROLLED "GCC unroll 8"
 #define LATER(i, k) \\
-    _Pragma("GCC unroll 8") for (int i = N - 1; i > k; --i) if (reach[k] >> i & 1)"""
+    _Pragma("GCC unroll 8") for (int i = N - 1; i > k; --i) if (reach[k] >> i & 1)
+#if WIDE == 1
+#define EACH_VECTOR BODY(0)
+#elif WIDE == 2
+#define EACH_VECTOR BODY(0) BODY(1)
+#elif WIDE == 3
+#define EACH_VECTOR BODY(0) BODY(1) BODY(2)
+#elif WIDE == 4
+#define EACH_VECTOR BODY(0) BODY(1) BODY(2) BODY(3)
+#else
+#define EACH_VECTOR EACH(b, WIDE) BODY(b)
+#endif
+/* The vector b of a row of X, of which all entries are given. */
+#define TAKE(b, ...) TAKE_##b(__VA_ARGS__)
+#if LANES == 8
+#define TAKE_0(...) (vec){__VA_ARGS__}
+#elif LANES == 4
+#define TAKE_0(p, q, r, s, ...) (vec){p, q, r, s}
+#define TAKE_1(p, q, r, s, ...) (vec){__VA_ARGS__}
+#else
+#define TAKE_0(p, q, ...) (vec){p, q}
+#define TAKE_1(p, q, r, s, ...) (vec){r, s}
+#define TAKE_2(p, q, r, s, t, u, ...) (vec){t, u}
+#define TAKE_3(p, q, r, s, t, u, v, w) (vec){v, w}
+#endif"""
 
 _UNROLLED_TIMES_Q = """\
 /* x = Q x: reflection k leaves the numbers before the k-th, and its own entry there is 1.  Two at

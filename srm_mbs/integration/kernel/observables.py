@@ -16,6 +16,7 @@ from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.reactions import Reactions, named_reactions
 from srm_mbs.dynamics.constraints.rheonomic import all_rows, constraint_errors, unscaled_rows
 from srm_mbs.dynamics.constraints.row_algebra import INERT, SingularValues, active_rows
+from srm_mbs.dynamics.constraints.rows import KEPT_SYSTEMS
 from srm_mbs.dynamics.forces import ForceKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
@@ -27,7 +28,7 @@ from srm_mbs.dynamics.observables import (
     working_elements,
 )
 from srm_mbs.integration.kernel.marshalling import force_struct, system_struct
-from srm_mbs.integration.kernel.system import KEPT, workspace
+from srm_mbs.integration.kernel.system import workspace
 from srm_mbs.model.drives import in_order_of_rows
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model
@@ -59,7 +60,7 @@ def _idle_all_rows(mechanism: Mechanism) -> deque[Any]:
     same = not (mechanism.drives or mechanism.forces) and mechanism.model.nq == mechanism.model.nv
     if known is not None and same:
         return known
-    return deque(maxlen=1 if mechanism.model.nv > LARGE else KEPT)
+    return deque(maxlen=1 if mechanism.model.nv > LARGE else KEPT_SYSTEMS)
 
 
 class _Lent:

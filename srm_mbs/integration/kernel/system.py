@@ -21,8 +21,6 @@ from srm_mbs.integration.kernel.marshalling import system_struct
 from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.model.mechanism import MechanismData, per_model
 
-KEPT = KEPT_SYSTEMS
-"""Idle workspaces that a mechanism keeps at most."""
 LARGEST_KEPT = 64
 """Coordinates of a mechanism that keeps any: one takes 1.7 MB there."""
 
@@ -63,7 +61,7 @@ def idle_workspaces(mechanism: MechanismData) -> deque[Any]:
     """The pool of a mechanism: kernel systems of :func:`shared` ones that no run uses; those of
     variants with the same rows and without force elements are the same."""
     if mechanism.forces or not structure_of(mechanism).rank:
-        return deque(maxlen=KEPT)
+        return deque(maxlen=KEPT_SYSTEMS)
     return rows_in_use(mechanism).idle
 
 
@@ -71,8 +69,8 @@ class workspace:  # noqa: N801 - used as a function
     """A kernel system of ``system`` for one user: an idle one of its mechanism, or a new one;
     ``code`` as for :func:`make_kernel_system`.  A context manager, whose object it is.
 
-    It returns to the pool afterwards, if it is :func:`shared` and there are not KEPT already.  One
-    whose user raised is left to the garbage collector.
+    It returns to the pool afterwards, if it is :func:`shared`.  One whose user raised is left to
+    the garbage collector.
 
     A program that ends waits for the user's thread, which sleeps from its next call of the kernel
     on: its Python code between such calls may be in C++ of a library, where CPython's end of a

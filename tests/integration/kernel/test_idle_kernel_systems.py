@@ -16,6 +16,7 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.dynamics.constraints.rows import KEPT_SYSTEMS
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import ControllerError
 from srm_mbs.integration.kernel import backend as kernel
@@ -110,18 +111,17 @@ def test_runs_at_the_same_time_do_not_share() -> None:
     with ThreadPoolExecutor(4) as pool:
         for found in pool.map(lambda _: run(mechanism), range(40)):
             assert np.array_equal(found.steps.states, expected.steps.states)
-    assert 1 <= len(idle(mechanism)) <= kernel_systems.KEPT
+    assert 1 <= len(idle(mechanism)) <= KEPT_SYSTEMS
 
 
 def test_no_more_than_a_few_are_kept() -> None:
     system = make_system(fresh())
     with ExitStack() as stack:
         borrowed = [
-            stack.enter_context(kernel_systems.workspace(system))
-            for _ in range(2 * kernel_systems.KEPT)
+            stack.enter_context(kernel_systems.workspace(system)) for _ in range(2 * KEPT_SYSTEMS)
         ]
-        assert len(set(map(id, borrowed))) == 2 * kernel_systems.KEPT
-    assert len(idle(system.mechanism)) == kernel_systems.KEPT
+        assert len(set(map(id, borrowed))) == 2 * KEPT_SYSTEMS
+    assert len(idle(system.mechanism)) == KEPT_SYSTEMS
 
 
 def test_pickles_and_copies_carry_none() -> None:

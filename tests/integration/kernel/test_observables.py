@@ -149,18 +149,22 @@ def test_powers_at_stages_are_those_of_the_states_there() -> None:
     """On Lie groups; of the reference by its own states, of the kernel in one call."""
     ring = floating_ring()
     ends = srm.Anchor(ring.model.names[2], xyz=(0.1, 0.2, 0.3)), srm.Anchor("world")
-    dampers = (srm.SpringDamper(*ends, 30.0, 2.0, 0.2, "strut"),)
-    mechanism = dataclasses.replace(ring, forces=dampers)
+    strut = srm.SpringDamper(*ends, 30.0, 2.0, 0.2, "strut")
+    # Its force is along the line that joins the points, also where it has no spring.
+    damper = srm.SpringDamper(*ends, 0.0, 3.0, 0.0, "damper")
+    mechanism = dataclasses.replace(ring, forces=(strut, damper))
     t, q, v = states(mechanism)
     steps = np.sort(t), np.hstack([q, v])
     rates = np.random.default_rng(7).standard_normal((COUNT - 1, 3, 2 * mechanism.model.nv))
     A, c, chosen = np.array([[0.2, 0.0], [0.3, 0.5]]), np.array([0.2, 0.8]), np.array([1, 4])
     compiled, reference = both(mechanism)
     found, expected = (
-        own.stage_powers(chosen, *steps, rates, A, c)["strut"] for own in (compiled, reference)
+        own.stage_powers(chosen, *steps, rates, A, c) for own in (compiled, reference)
     )
-    assert found.shape == (2, 2)
-    same(found, expected)
+    assert found["strut"].shape == (2, 2)
+    for name in ("strut", "damper"):
+        same(found[name], expected[name])
+        same(compiled.powers(t, q, v)[name], reference.powers(t, q, v)[name])
     for own in (compiled, reference):  # of a run without steps
         assert own.stage_powers(chosen[:0], *steps, rates, A, c)["strut"].shape == (0, 2)
     h = steps[0][5] - steps[0][4]
@@ -168,7 +172,7 @@ def test_powers_at_stages_are_those_of_the_states_there() -> None:
     place = pin.integrate(mechanism.model, q[4], h * moved[: mechanism.model.nv])
     rate = v[4] + h * moved[mechanism.model.nv :]
     there = reference.powers(steps[0][4:5] + 0.8 * h, place[None], rate[None])["strut"]
-    same(expected[1, 1:], there)
+    same(expected["strut"][1, 1:], there)
 
 
 @pytest.mark.parametrize("kind", ELEMENTS)

@@ -259,7 +259,8 @@ def _library(structure: Structure, parameters: FloatArray) -> Library:
     source = source_of_structure(structure)
     load, identity = _loader(parameters), identity_of(structure)
     try:
-        return remember(structure, *compile_and_load(source.text, load, identity=identity))
+        made = compile_and_load(source.text, load, source.units, identity=identity)
+        return remember(structure, *made)
     except CompilationError as error:
         raise InputError(
             f"the generated code cannot be compiled: {error}",
@@ -286,7 +287,9 @@ def begin_compilation(structure: Structure, source: Source) -> Compilation | Non
         If there is no compiler, or it cannot be started.
     """
     identity = identity_of(structure)
-    return Compilation.begin(source.text, identity, PATIENCE, alone=True, background=True)
+    return Compilation.begin(
+        source.text, source.units, identity, PATIENCE, alone=True, background=True
+    )
 
 
 def take_compilation(

@@ -23,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -52,12 +52,12 @@ _SEARCHES = {
     "max-dse-active-local-stores": 50,
 }
 FLAGS = (
-    *("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno"),
+    *("-std=c11", "-O2", "-fPIC", "-ffp-contract=fast", "-fno-math-errno"),
     "-fno-gcse",
     *[text for name, most in _SEARCHES.items() for text in ("--param", f"{name}={most}")],
 )
 # Of C's library, the process has what the code takes of it; macOS links nothing without it.
-_LIBRARIES = ("-nostdlib", "-lm") if sys.platform == "linux" else ("-lm",)
+_LINKING = ("-shared", *(("-nostdlib",) if sys.platform == "linux" else ()), "-lm")
 # Terms are scalars, of which a compiler finds pairs but hardly fours: to put these together takes
 # more instructions than it saves.  The algebra names the vectors that it has.
 _INTEL = ("-march=native", "-mprefer-vector-width=128")
@@ -276,6 +276,7 @@ def load_cached(identity: str, load: Callable[[Path], Loaded]) -> tuple[Loaded, 
 def compile_and_load(
     source: str,
     load: Callable[[Path], Loaded],
+    units: int = 1,
     patience: float = PATIENCE,
     identity: str | None = None,
 ) -> tuple[Loaded, Compiled]:
@@ -289,6 +290,9 @@ def compile_and_load(
         C11.
     load
         Raises ValueError for a library that cannot be loaded, which is then compiled again.
+    units
+        Translation units of ``source``, which knows by the macro UNIT, from 1 on, for which of them
+        it is read.  They are compiled at the same time.
     patience
         Time (s) that the compiler has.
     identity
@@ -305,9 +309,8 @@ def compile_and_load(
         found = load_cached(identity, load)
         if found is not None:
             return found
-        begun = Compilation.begin(
-            source, identity, patience, alone=time.monotonic() < deadline, background=False
-        )
+        alone = time.monotonic() < deadline
+        begun = Compilation.begin(source, units, identity, patience, alone=alone, background=False)
         if begun is not None:
             break
         time.sleep(_WAIT)
@@ -326,7 +329,8 @@ class Compilation:
 
     def __init__(self, key: str, library: Path | None, chosen: Compiler) -> None:
         self._key, self._library, self._compiler = key, library, chosen
-        self._process: subprocess.Popen[bytes] | None = None
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self._linking: list[str] = []
         self._lock_file: IO[bytes] | None = None
         self._folder: Path | None = None
         self._owner = os.getpid()
@@ -336,19 +340,26 @@ class Compilation:
 
     @classmethod
     def begin(
-        cls, source: str, identity: str, patience: float, *, alone: bool, background: bool
+        cls,
+        source: str,
+        units: int,
+        identity: str,
+        patience: float,
+        *,
+        alone: bool,
+        background: bool,
     ) -> Compilation | None:
         """Start the compiler.
 
         Parameters
         ----------
-        source, identity, patience
+        source, units, identity, patience
             As for :func:`compile_and_load`.
         alone
             Whether None is returned where another process compiles the same, or just has.
         background
-            Whether it runs at a low priority.  One of this process that does, and compiles the
-            same, is ended by one that does not.
+            Whether it runs at a low priority, with one unit after the other.  One of this process
+            that does, and compiles the same, is ended by one that does not.
 
         Raises
         ------
@@ -374,7 +385,7 @@ class Compilation:
             if made._lock_file is not None and made._library and _intact(made._library):
                 made.end()
                 return None
-            made._start(made._write_source(source, folder), NICENESS if background else 0)
+            made._start(made._write_units(source, units, folder), background)
         except BaseException:
             made.end()
             raise
@@ -402,8 +413,8 @@ class Compilation:
         self._lock_file = file
         return True
 
-    def _write_source(self, source: str, folder: Path | None) -> Path:
-        """Write the source into a new folder.
+    def _write_units(self, source: str, units: int, folder: Path | None) -> list[Path]:
+        """Write the units of the source into a new folder.
 
         It lies in the cache, which is cleaned of the folders of killed processes, or where that has
         no room, elsewhere.
@@ -411,23 +422,38 @@ class Compilation:
         for place, prefix in ((folder, "new-"), (None, "srm-mbs-")):
             try:
                 self._folder = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
-                (self._folder / f"{self._key}.c").write_text(source)
-                return self._folder
+                paths = [self._folder / f"{number}.c" for number in range(1, units + 1)]
+                for path in paths:
+                    path.write_text(f"#define UNIT {path.stem}\n{source}")
+                return paths
             except OSError as error:
                 problem = f"the code cannot be written: {error}"
                 if self._folder is not None:
                     shutil.rmtree(self._folder, ignore_errors=True)
         raise CompilationError(problem, "Make room for temporary files")
 
-    def _start(self, folder: Path, niceness: int) -> None:
-        """Start the compiler in the ``folder`` of its source."""
-        made, text = (str(folder / f"{self._key}{suffix}") for suffix in (".so", ".c"))
-        command = [*self._compiler.command, *FLAGS, "-o", made, text, *_LIBRARIES]
+    def _start(self, texts: Sequence[Path], background: bool) -> None:
+        """Start a compiler for each of the ``texts``, or in the background one for all of them."""
+        command, folder = [*self._compiler.command, *FLAGS], texts[0].parent
+        linked = ["-o", str(folder / f"{self._key}.so")]
+        if background or len(texts) == 1:
+            self._run([*command, *linked, *map(str, texts), *_LINKING], folder)
+        else:
+            objects = [str(text.with_suffix(".o")) for text in texts]
+            self._linking = [*command, *linked, *objects, *_LINKING]
+            for text, made in zip(texts, objects):
+                self._run([*command, "-c", "-o", made, str(text)], folder)
+        if background:
+            with suppress(OSError):  # it may have ended
+                os.setpriority(os.PRIO_PGRP, self._processes[0].pid, NICENESS)
+
+    def _run(self, command: Sequence[str], folder: Path) -> None:
+        """Start a process in the ``folder`` of the source."""
         own = folder if self._library is None else self._library.with_name(_COMPILER_FOLDER)
         environment = {name: str(own) for name in self._compiler.folders} | os.environ
         try:
-            with open(folder / _MESSAGES, "wb") as messages:
-                self._process = subprocess.Popen(
+            with open(folder / _MESSAGES, "ab") as messages:
+                process = subprocess.Popen(
                     command,
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
@@ -439,14 +465,20 @@ class Compilation:
         except OSError as error:
             problem = f"the C compiler {command[0]} cannot be run: {error}"
             raise CompilationError(problem, "Install a C compiler") from error
-        if niceness:
-            with suppress(OSError):  # it may have ended
-                os.setpriority(os.PRIO_PGRP, self._process.pid, niceness)
+        self._processes.append(process)
+
+    def _link(self) -> bool:
+        """Start what links the units, if all are compiled and it was not yet; whether it does."""
+        command, self._linking, folder = self._linking, [], self._folder
+        if not command or folder is None or any(own.returncode for own in self._processes):
+            return False
+        self._run(command, folder)
+        return True
 
     @property
     def ended(self) -> bool:
         """Whether :meth:`end` was called."""
-        return self._process is None
+        return not self._processes
 
     def poll(self) -> bool:
         """Whether the compiler has ended.
@@ -456,10 +488,8 @@ class Compilation:
         CompilationError
             As :meth:`wait`.
         """
-        process = self._process
-        if process is None:
-            return True
-        if process.poll() is not None:
+        working = [process for process in self._processes if process.poll() is None]
+        if not working and not self._link():
             self._seconds = time.monotonic() - self._started
             return True
         if time.monotonic() - self._started > self._patience:
@@ -474,12 +504,12 @@ class Compilation:
         CompilationError
             If it does not end in time.
         """
-        process = self._process
-        if process is None:
-            return
-        left = self._started + self._patience - time.monotonic()
+        deadline = self._started + self._patience
         try:
-            process.wait(max(left, 0.0))
+            for process in self._processes:  # while it grows
+                process.wait(max(deadline - time.monotonic(), 0.0))
+                if process is self._processes[-1]:
+                    self._link()
         except subprocess.TimeoutExpired:
             self._hangs()
         self._seconds = time.monotonic() - self._started
@@ -498,11 +528,12 @@ class Compilation:
         CompilationError
             If the compiler failed, or was ended.
         """
-        name, process, folder = self._compiler.command[0], self._process, self._folder
-        if process is None or folder is None:
+        name, folder = self._compiler.command[0], self._folder
+        if self.ended or folder is None:
             raise CompilationError(f"the C compiler {name} was ended", "Compile it again")
         made = folder / f"{self._key}.so"
-        if process.returncode or not made.is_file():
+        failed = any(process.returncode for process in self._processes)
+        if failed or not made.is_file():
             said = _last_line(folder / _MESSAGES)
             raise CompilationError(
                 f"the C compiler {name} failed: {said}", "Use another C compiler"
@@ -519,15 +550,17 @@ class Compilation:
     def end(self) -> None:
         """End the compiler, if it is at work, and remove its folder."""
         _background.pop(self._key, None)
-        process, folder, file = self._process, self._folder, self._lock_file
-        self._process = self._folder = self._lock_file = None
+        processes, folder, file = self._processes, self._folder, self._lock_file
+        self._processes, self._folder, self._lock_file = [], None, None
+        working = [process for process in processes if process.returncode is None]
         if self._owner != os.getpid():
-            if process is not None and process.returncode is None:
+            for process in working:
                 process.returncode = 0  # the fork's: its collection would warn
             return
-        if process is not None and process.returncode is None:
+        for process in working:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)  # compilers start others
+        for process in working:
             process.wait()
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)

@@ -83,10 +83,12 @@ def _algebra(structure: Structure, targets: Sequence[str]) -> str:
 
 
 # Statements without a branch, each computed once, leave nothing to these passes of GCC, which take
-# a quarter of its time, in large mechanisms half.  The pragma, because Clang refuses the flags, and
-# earlier versions of GCC forget those of the command line at it.
+# a third of its time, in large mechanisms half; the first two find nothing in loops either.  The
+# pragma, because Clang refuses the flags, and earlier versions of GCC forget those of the command
+# line at it.
 _PASSES = """\
 #if __GNUC__ >= 12 && !defined __clang__
+#pragma GCC optimize ("no-tree-dominator-opts,no-thread-jumps")
 #pragma GCC push_options
 #pragma GCC optimize ("no-tree-pre,no-code-hoisting,no-tree-pta,no-tree-slsr,no-tree-sink")
 #pragma GCC optimize ("no-dse,no-rerun-cse-after-loop,no-ivopts,no-tree-tail-merge")

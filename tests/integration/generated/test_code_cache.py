@@ -23,6 +23,15 @@ from tests.support.commands import row, run
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
 SEVEN = "int seven(void) { return 7; }\n"
+IN_TWO_UNITS = """
+#if UNIT == 1
+int three(void);
+int seven(void) { return 4 + three(); }
+#elif UNIT == 2
+int three(void) { return 3; }
+#endif
+"""
+"""The same in two units, which are linked."""
 
 
 @pytest.fixture(autouse=True)
@@ -266,6 +275,42 @@ def test_a_compiler_that_hangs_is_ended_with_its_children(program: Path, tmp_pat
         compile_and_load(SEVEN, _seven, patience=0.3)
     assert time.perf_counter() - started < 5.0
     time.sleep(2.0)
+    assert not mark.exists()
+
+
+def test_units_are_compiled_at_the_same_time_and_linked(program: Path, tmp_path: Path) -> None:
+    """Each compiler waits until the other one is at work."""
+    started = tmp_path / "started"
+    wait = f"echo >> {started}; until [ $(wc -l < {started}) -ge 2 ]; do sleep 0.01; done"
+    real = shutil.which("cc")
+    _write_program(program, f'case "$*" in *" -c "*) {wait};; esac; exec {real} "$@"')
+    value, made = compile_and_load(IN_TWO_UNITS, _seven, 2, patience=60.0)
+    assert (value, made.seconds > 0.0) == (7, True)
+    assert started.read_text() == "\n\n"
+
+
+@pytest.mark.parametrize("failing", ["/1.c", "/2.c", "-shared"])
+def test_each_unit_and_their_link_may_fail(program: Path, folder: Path, failing: str) -> None:
+    cannot = f'case "$*" in *{failing}*) echo cannot do it >&2; exit 3;; esac'
+    _write_program(program, f'{cannot}; exec {shutil.which("cc")} "$@"')
+    with pytest.raises(CompilationError, match="compiler failed: cannot do it"):
+        compile_and_load(IN_TWO_UNITS, _seven, 2)
+    assert not list(folder.iterdir())
+
+
+@pytest.mark.parametrize("hanging", ["/1.c", "/2.c", "-shared"])
+def test_each_unit_and_their_link_may_hang(
+    program: Path, folder: Path, tmp_path: Path, hanging: str
+) -> None:
+    mark, seen = tmp_path / "child", tmp_path / "seen"
+    hangs = f"(sleep 3; touch {mark}) & echo $$ > {seen}; sleep 60"
+    script = f'case "$*" in *{hanging}*) {hangs};; esac; exec {shutil.which("cc")} "$@"'
+    _write_program(program, script)
+    with pytest.raises(CompilationError, match="made nothing within 2 s"):
+        compile_and_load(IN_TWO_UNITS, _seven, 2, patience=2.0)
+    assert not Path(f"/proc/{seen.read_text().strip()}").exists()
+    assert not list(folder.iterdir())
+    time.sleep(1.5)
     assert not mark.exists()
 
 

@@ -34,6 +34,8 @@ pytestmark = [
 
 PATIENCE = 60.0
 """Time (s) that a busy machine has for what takes 0.1 s."""
+CALLS = 3
+"""Calls of the compiler for what is compiled ahead: two units, and their link."""
 
 
 @pytest.fixture(autouse=True)
@@ -240,7 +242,7 @@ def test_a_long_run_begins_the_compilation_and_stays_with_its_backend() -> None:
 
     def event(t: float, q: np.ndarray, v: np.ndarray) -> float:
         if policy._job is not None:
-            process = policy._job.compilation._process
+            process = policy._job.compilation._processes[0]
             assert process is not None
             process.wait()
         if code.arrivals():
@@ -504,7 +506,7 @@ while policy._job is None and srm.simulate(mechanism, 2.0).settings.backend == "
 """
 BESIDE = f"""{RUNS}
 calls = Path(os.environ["CC"]).with_name("calls")
-while str(policy._job.compilation._process.pid) not in calls.read_text().split():
+while str(policy._job.compilation._processes[0].pid) not in calls.read_text().split():
     assert time.monotonic() - started < 60.0
     time.sleep(0.01)
 """
@@ -531,7 +533,7 @@ def test_what_is_compiled_when_a_program_ends_is_kept(
     program: Callable[[str], Path], folder: Path
 ) -> None:
     program("exec CC")
-    script = f"{BESIDE}\npolicy._job.compilation._process.wait()"
+    script = f"{BESIDE}\npolicy._job.compilation._processes[0].wait()"
     subprocess.run([sys.executable, "-c", script], check=True)
     assert [path.suffix for path in sorted(folder.iterdir())] == [".sha256", ".so"]
     assert finished(srm.load("four_bar"), 0.1).settings.backend == "generated"
@@ -580,7 +582,7 @@ def test_a_process_that_needs_the_code_waits_for_the_one_that_compiles_it(
     ]
     said = [one.communicate()[0] for one in programs]
     assert sorted("found" in text for text in said) == [False, True]
-    assert calls.read_text().count("\n") == 1
+    assert calls.read_text().count("\n") == CALLS
 
 
 @pytest.mark.stress
@@ -629,7 +631,20 @@ def test_code_that_another_process_compiled_meanwhile_is_taken(
     monkeypatch.setattr(code, "_libraries", type(code._libraries)())
     monkeypatch.setattr(code, "_arrivals", 0)
     _runs(mechanism)
-    assert calls.read_text().count("\n") == 1
+    assert calls.read_text().count("\n") == CALLS
+
+
+def test_code_that_is_compiled_beside_the_program_is_that_which_is_compiled_ahead(
+    folder: Path,
+) -> None:
+    """Bit by bit: one compiler for both units, and one for each."""
+    _runs(_used())
+    (library,) = folder.glob("*.so")
+    beside = library.read_bytes()
+    code_cache.clear()
+    code._libraries.clear()
+    assert srm.compile(srm.load("four_bar")).seconds > 0.0
+    assert library.read_bytes() == beside
 
 
 @pytest.mark.stress

@@ -291,8 +291,8 @@ def compile_and_load(
     load
         Raises ValueError for a library that cannot be loaded, which is then compiled again.
     units
-        Translation units of ``source``, which knows by the macro UNIT, from 1 on, for which of them
-        it is read.  They are compiled at the same time.
+        Translation units of ``source``, which are compiled at the same time: it has all of them, or
+        where the macro UNIT is defined, as 1, 2, ..., that one.
     patience
         Time (s) that the compiler has.
     identity
@@ -358,8 +358,9 @@ class Compilation:
         alone
             Whether None is returned where another process compiles the same, or just has.
         background
-            Whether it runs at a low priority, with one unit after the other.  One of this process
-            that does, and compiles the same, is ended by one that does not.
+            Whether it runs at a low priority, and compiles all units as one, which takes less CPU
+            time.  One of this process that does, and compiles the same, is ended by one that does
+            not.
 
         Raises
         ------
@@ -385,7 +386,8 @@ class Compilation:
             if made._lock_file is not None and made._library and _intact(made._library):
                 made.end()
                 return None
-            made._start(made._write_units(source, units, folder), background)
+            texts = made._write_units(source, 1 if background else units, folder)
+            made._start(texts, NICENESS if background else 0)
         except BaseException:
             made.end()
             raise
@@ -424,7 +426,7 @@ class Compilation:
                 self._folder = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
                 paths = [self._folder / f"{number}.c" for number in range(1, units + 1)]
                 for path in paths:
-                    path.write_text(f"#define UNIT {path.stem}\n{source}")
+                    path.write_text(f"#define UNIT {path.stem}\n{source}" if units > 1 else source)
                 return paths
             except OSError as error:
                 problem = f"the code cannot be written: {error}"
@@ -432,20 +434,21 @@ class Compilation:
                     shutil.rmtree(self._folder, ignore_errors=True)
         raise CompilationError(problem, "Make room for temporary files")
 
-    def _start(self, texts: Sequence[Path], background: bool) -> None:
-        """Start a compiler for each of the ``texts``, or in the background one for all of them."""
+    def _start(self, texts: Sequence[Path], niceness: int) -> None:
+        """Start a compiler for each of the ``texts``."""
         command, folder = [*self._compiler.command, *FLAGS], texts[0].parent
         linked = ["-o", str(folder / f"{self._key}.so")]
-        if background or len(texts) == 1:
-            self._run([*command, *linked, *map(str, texts), *_LINKING], folder)
+        if len(texts) == 1:
+            self._run([*command, *linked, str(texts[0]), *_LINKING], folder)
         else:
             objects = [str(text.with_suffix(".o")) for text in texts]
             self._linking = [*command, *linked, *objects, *_LINKING]
             for text, made in zip(texts, objects):
                 self._run([*command, "-c", "-o", made, str(text)], folder)
-        if background:
-            with suppress(OSError):  # it may have ended
-                os.setpriority(os.PRIO_PGRP, self._processes[0].pid, NICENESS)
+        if niceness:
+            for process in self._processes:
+                with suppress(OSError):  # it may have ended
+                    os.setpriority(os.PRIO_PGRP, process.pid, niceness)
 
     def _run(self, command: Sequence[str], folder: Path) -> None:
         """Start a process in the ``folder`` of the source."""

@@ -11,6 +11,9 @@ from srm_mbs.integration.generated.frames import shortest_terms
 from srm_mbs.integration.generated.linearisation import linearisation_of
 from srm_mbs.integration.generated.structure import Structure
 
+FEWEST_DIVIDED = 500
+"""Statements from which on the algebra may be a unit of its own: with fewer, another compiler takes
+longer to start than it saves."""
 ABI = 3
 """Version of the functions that the kernel calls: ``interface_version`` in generated.cpp."""
 
@@ -23,7 +26,8 @@ class Source(NamedTuple):
     text
         All of it.
     units
-        Its translation units: where UNIT is defined, as 1, 2, ..., it has what belongs to that one.
+        Translation units into which it is worth dividing: where UNIT is defined, as 1, 2, ..., it
+        has what belongs to that one.
     operations
         Number of its statements.
     """
@@ -59,15 +63,16 @@ def source_of(structure: Structure) -> Source:
         constants=written.constants,
         terms=written.terms,
     )
-    units = [terms + linear.text]
+    parts = [terms + linear.text]
     algebra = _algebra(structure, [output.target for output in recorded.outputs])
     if algebra:
         # Algebra with loops needs the passes that unrolled algebra does not.
-        units.append((_ALL_PASSES if structure.nv > LARGEST_UNROLLED else "") + algebra)
+        parts.append((_ALL_PASSES if structure.nv > LARGEST_UNROLLED else "") + algebra)
     text = _HEAD.format(passes=_PASSES, prototypes=PROTOTYPES)
-    for number, unit in enumerate(units, start=1):
-        text += f"\n#if !defined UNIT || UNIT == {number}\n{unit.strip()}\n#endif\n"
-    return Source(text, len(units), written.operations + linear.operations)
+    for number, part in enumerate(parts, start=1):
+        text += f"\n#if !defined UNIT || UNIT == {number}\n{part.strip()}\n#endif\n"
+    operations = written.operations + linear.operations
+    return Source(text, len(parts) if operations >= FEWEST_DIVIDED else 1, operations)
 
 
 def _algebra(structure: Structure, targets: Sequence[str]) -> str:
@@ -94,7 +99,8 @@ _PASSES = """\
 #pragma GCC optimize ("no-dse,no-rerun-cse-after-loop,no-ivopts,no-tree-tail-merge")
 #pragma GCC optimize ("no-tree-loop-distribute-patterns,no-isolate-erroneous-paths-dereference")
 #pragma GCC optimize ("no-ipa-icf,no-ipa-cp,no-ipa-sra,no-ipa-ra,no-ipa-modref")
-#pragma GCC optimize ("no-ipa-pure-const,no-ipa-reference")
+#pragma GCC optimize ("no-ipa-pure-const,no-ipa-reference,no-tree-ccp,no-tree-bit-ccp")
+#pragma GCC optimize ("no-tree-dse,no-forward-propagate,no-cprop-registers")
 #endif"""
 _ALL_PASSES = """
 #if __GNUC__ >= 12 && !defined __clang__

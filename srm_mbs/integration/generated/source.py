@@ -100,7 +100,7 @@ _PASSES = """\
 #pragma GCC optimize ("no-tree-loop-distribute-patterns,no-isolate-erroneous-paths-dereference")
 #pragma GCC optimize ("no-ipa-icf,no-ipa-cp,no-ipa-sra,no-ipa-ra,no-ipa-modref")
 #pragma GCC optimize ("no-ipa-pure-const,no-ipa-reference,no-tree-ccp,no-tree-bit-ccp")
-#pragma GCC optimize ("no-tree-dse,no-forward-propagate,no-cprop-registers")
+#pragma GCC optimize ("no-tree-dse,no-cprop-registers")
 #endif"""
 _ALL_PASSES = """
 #if __GNUC__ >= 12 && !defined __clang__

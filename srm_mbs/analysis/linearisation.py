@@ -10,7 +10,7 @@ linear in the forces.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from numbers import Integral
 from typing import Any
 
@@ -76,7 +76,7 @@ class Linearisation:
     inputs: tuple[str, ...]
     drift: FloatArray
     to_joints: FloatArray
-    chart: TangentChart
+    chart: TangentChart = field(repr=False)
 
     @cached_property
     def _eigen(self) -> tuple[Any, Any]:

@@ -185,6 +185,13 @@ class LinkageReport:
             if stroke.time_ratio is not None:
                 yield "  time ratio", f"{stroke.time_ratio:.6g}"
 
+    def __repr__(self) -> str:
+        motion = "turns fully" if self.turns else f"{len(self.dead_points)} dead points"
+        return (
+            f"LinkageReport({self.mechanism.name!r}, crank={self.crank!r}, {motion}, "
+            f"{len(self.positions)} positions, {len(self.joints)} joints)"
+        )
+
     def __str__(self) -> str:
         rows = list(self.rows())
         width = max(len(name) for name, _ in rows)

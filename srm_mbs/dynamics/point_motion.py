@@ -42,6 +42,9 @@ class PointMotion:
     def __init__(self, read: Callable[[str], FloatArray]) -> None:
         self._read = read
 
+    def __repr__(self) -> str:
+        return "PointMotion(position, velocity, acceleration)"
+
     @cached_property
     def position(self) -> FloatArray:
         return self._read("position")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs.errors import InputError, known_names, safe_repr
+from srm_mbs.errors import InputError, joined_names, known_names, safe_repr
 from srm_mbs.model.numbers import vector
 
 _UNTURNED, _IDENTITY = np.eye(3), np.eye(4)
@@ -115,9 +115,14 @@ class Anchor:
             kind = "link" if self.link is not None else "frame"
             names = {f.name for f in model.frames if kind == "frame" or f.type == body}
             names = names - {"universe"} | {WORLD}
-            raise InputError(
-                f"there is no {kind} {safe_repr(self.where)}", remedy=known_names(sorted(names))
-            )
+            remedy = known_names(sorted(names))
+            if model.existJointName(self.where):
+                joint = model.getJointId(self.where)
+                moved = [f.name for f in model.frames if f.type == body and f.parentJoint == joint]
+                remedy += f". The joint of this name moves {joined_names(moved)}"
+                if not moved:
+                    remedy += ": add a link with model.addBodyFrame"
+            raise InputError(f"there is no {kind} {safe_repr(self.where)}", remedy=remedy)
         return model.frames[index]
 
 

@@ -6,7 +6,7 @@ A tree must be in Pinocchio's order of joints, and its inertias must determine i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Protocol, TypeVar
 
@@ -277,10 +277,12 @@ def checked_start(model: pin.Model, q0: Any, v0: Any) -> tuple[FloatArray, Float
 def _frozen_array(values: Any, size: int, name: str) -> FloatArray:
     array = finite_array(values, (size,))
     if array is None:
+        remedy = f"Give {size} finite numbers"
+        if isinstance(values, Mapping):
+            kind = name[0]  # q or v
+            remedy += f"; srm.assemble(mechanism, {kind}=...) makes them from values of joints"
         raise InputError(
-            f"{name} does not consist of {size} finite numbers",
-            element=name,
-            remedy=f"Give {size} finite numbers",
+            f"{name} does not consist of {size} finite numbers", element=name, remedy=remedy
         )
     array.setflags(write=False)
     return array

@@ -102,6 +102,12 @@ class EnergyBalance:
         """Largest residual over the scale; 0 where nothing moved but for rounding."""
         return self.largest_residual / self.scale if self.scale > self.rounding else 0.0
 
+    def __repr__(self) -> str:
+        return (
+            f"EnergyBalance({len(self.t)} times, residual at most {self.largest_residual:.2g} J "
+            f"of {self.scale:.3g} J, works={list(self.works)})"
+        )
+
 
 _System = OpenSystem | ClosedSystem
 

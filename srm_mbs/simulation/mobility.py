@@ -77,6 +77,10 @@ class MobilityMap:
     coordinates: tuple[str, ...]
     _solution: SimulationResult = field(repr=False)
 
+    def __repr__(self) -> str:
+        freedom = ", ".join(str(count) for count in np.unique(self.degrees_of_freedom))
+        return f"MobilityMap({len(self.t)} times, degrees of freedom {freedom})"
+
     @cached_property
     def changes(self) -> tuple[MobilityChange, ...]:
         """Singular configurations that the run met, in order of time."""

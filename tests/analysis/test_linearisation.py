@@ -188,3 +188,9 @@ def test_inconsistent_rates_are_refused() -> None:
     mechanism = load("four_bar")
     with pytest.raises(srm.InputError, match=r"not consistent: .*, rate 7.6e-01"):
         srm.linearise(mechanism, mechanism.q0, [1.0, 0.0, 0.0])
+
+
+def test_a_linearisation_shows_its_matrices_and_no_object_without_values() -> None:
+    shown = repr(srm.linearise(load("four_bar")))
+    assert "A=array(" in shown
+    assert "object at" not in shown

@@ -206,3 +206,13 @@ def test_the_command_linkage_prints_the_table_and_draws_it(tmp_path: Path) -> No
     assert path.stat().st_size > 5000
     line = error_line(run("linkage", "four_bar", "--crank", "x", status=2))
     assert line.startswith("error: --crank: there is no moving joint 'x'")
+
+
+def test_a_report_is_shown_in_one_line_and_printed_as_a_table() -> None:
+    report = srm.linkage_report(load("four_bar"), "crank")
+    assert repr(report) == (
+        f"LinkageReport('four_bar', crank='crank', turns fully, {len(report.positions)} positions, "
+        "2 joints)"
+    )
+    assert str(report).startswith("crank ")
+    assert "time ratio" in str(report)

@@ -452,6 +452,16 @@ def test_an_anchor_on_a_link_takes_its_place_after_the_name() -> None:
         Anchor("rod", (1.0, 0.0))
 
 
+def test_a_joint_in_place_of_a_link_is_refused_with_the_links_that_it_moves() -> None:
+    model = srm.load("four_bar").model.copy()
+    knob = model.addJoint(0, pin.JointModelRY(), pin.SE3.Identity(), "knob")
+    with pytest.raises(srm.InputError, match=r"joint of this name moves none: add a link with"):
+        Anchor("knob").resolve(model)
+    model.addBodyFrame("handle", knob, pin.SE3.Identity(), 0)
+    with pytest.raises(srm.InputError, match=r"'knob'\. Known: .*this name moves handle$"):
+        Anchor("knob").resolve(model)
+
+
 @every_row
 @every_place
 def test_wrenches_of_the_rows_do_the_work_that_the_multipliers_do(kind: str, place: str) -> None:

@@ -84,3 +84,16 @@ def test_the_measures_of_a_sweep_are_those_of_dense_output_at_the_ends() -> None
         assert measures["drift"] == pytest.approx(ends.drift[1, 0], abs=1e-15)
         change = ends.energy[1] - ends.energy[0]
         assert measures["energy_change"] == pytest.approx(change, abs=1e-13)
+
+
+def test_everything_that_a_run_gives_is_shown_in_one_line() -> None:
+    solution = srm.simulate(srm.load("four_bar"), 0.5)
+    assert (
+        repr(srm.mobility_map(solution))
+        == f"MobilityMap({len(solution.t)} times, degrees of freedom 1)"
+    )
+    balance = repr(solution.energy_balance)
+    assert balance.startswith(f"EnergyBalance({len(solution.t)} times, residual at most ")
+    assert balance.endswith(" J, works=[])")
+    point = solution.point(srm.Anchor("coupler"))
+    assert repr(point) == "PointMotion(position, velocity, acceleration)"

@@ -14,7 +14,6 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import pinocchio as pin
-from scipy.spatial.transform import Rotation
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import BoolArray, FloatArray
@@ -182,6 +181,8 @@ class BodyMotion:
 
     def path(self, joint: int, placement: pin.SE3) -> FloatArray:
         """Positions (n, 3) m in the world of a point fixed to a joint (0: the ground)."""
+        from scipy.spatial.transform import Rotation
+
         offset = np.array(placement.translation)
         if joint == 0:
             return np.tile(offset, (len(self.times), 1))
@@ -290,6 +291,8 @@ def _interpolation_error(motion: BodyMotion, rates: FloatArray) -> float:
     ``rates`` (n, k, 6) of the joint frames (m/s, rad/s, world axes) reveal rotations that key
     frames alias: one and a half turns between two of them look like half a turn.
     """
+    from scipy.spatial.transform import Rotation
+
     if not rates[1:].size:
         return 0.0
     h = np.diff(motion.times)[:, None, None]

@@ -252,14 +252,6 @@ def variant_maker(mechanism: MechanismData) -> VariantMaker | None:
     return None
 
 
-@per_model
-def variant_origin(mechanism: MechanismData) -> MechanismData | None:
-    """The mechanism of which this one was made by :meth:`MechanismData.with_parameters`, or of
-    which that one was: much of what follows from both may be the same, which users have to check.
-    None for others."""
-    return None
-
-
 FRICTION_SPEED = 0.01
 """Default of ``friction_speed``, rad/s or m/s."""
 
@@ -471,7 +463,6 @@ class MechanismData(ResultOwner):
                 "with_parameters, not before",
             )
         made: Self = make(values)
-        variant_origin.keep(made, variant_origin(self) or self)
         return made
 
     @property

@@ -65,8 +65,10 @@ class Anchor:
         return str(self.link if self.link is not None else self.frame)
 
     def at(self, xyz: tuple[float, float, float]) -> Anchor:
-        """The same anchor with another origin (3,) m."""
-        return Anchor(self.link, self.frame, xyz, self.rpy)
+        """The same anchor with another origin (3,) m, finite floats."""
+        out = object.__new__(Anchor)
+        vars(out).update(vars(self), xyz=xyz)
+        return out
 
     def resolve(self, model: pin.Model) -> tuple[int, pin.SE3]:
         """Joint that carries the anchor (0: ground) and the anchor's placement in that joint.

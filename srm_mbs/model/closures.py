@@ -404,8 +404,7 @@ class LoopClosure:
         if self.type != "distance" or self.length is not None:
             _ = self.rows  # in the axes of the anchors, wherever these are: the copy has them, too
         out = object.__new__(type(self))
-        for name, value in (vars(self) | {"a": a, "b": b}).items():
-            object.__setattr__(out, name, value)
+        vars(out).update(vars(self), a=a, b=b)
         return out
 
     @property

@@ -160,7 +160,7 @@ def named_reactions(
         KnownKeys(zip(between, on_b)),
         KnownKeys((c.name, own) for c, own in zip(mechanism.loops, multipliers)),
         KnownKeys((drive.name, -own[:, 0]) for drive, own in driven),
-        KnownKeys(zip(mechanism.joint_names, np.moveaxis(joints, 1, 0)[1:])),
+        KnownKeys(zip(mechanism.joint_names, joints.transpose(1, 0, 2)[1:])),
     )
 
 

@@ -17,8 +17,8 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.assembly.assemble import consistent_start
 from srm_mbs.assembly.diagnosis import CORRECT_AXIS, inclined_axes
 from srm_mbs.assembly.implied_rows import without_implied_rows
-from srm_mbs.assembly.regular_start import Bodies, bodies_at_start
 from srm_mbs.assembly.position import CONSTRAINT_TOLERANCE, limit_springs
+from srm_mbs.assembly.regular_start import Bodies, bodies_at_start
 from srm_mbs.dynamics.constraints.reusable_analysis import ReusableAnalysis
 from srm_mbs.dynamics.constraints.structure import structure_of
 from srm_mbs.dynamics.mechanism import Mechanism
@@ -178,7 +178,9 @@ def _with_massless_ends(
 def _friction_note(
     model: pin.Model, forces: tuple[ForceElement, ...], friction_speed: float
 ) -> tuple[str, ...]:
-    if not model.friction.any() and not any(getattr(force, "friction", 0.0) for force in forces):
+    if not any(model.friction.tolist()) and not any(
+        getattr(force, "friction", 0.0) for force in forces
+    ):
         return ()
     return (
         "joint friction F acts as F tanh(v/v_s) with v_s = "

@@ -323,12 +323,10 @@ class MechanismData(ResultOwner):
         """
         made = object.__new__(cls)
         made._forget()
-        set_ = object.__setattr__
-        set_(made, "_tree_results", tree_results)
-        for name, value in values.items():
-            set_(made, name, value)
+        vars(made).update(values, _tree_results=tree_results)
         made._take_start(values["q0"], np.zeros(made.model.nv))
-        set_(made, "loops", tuple(loop.measured(made.model, made.q0) for loop in made.loops))
+        loops = tuple(loop.measured(made.model, made.q0) for loop in made.loops)
+        object.__setattr__(made, "loops", loops)
         return made
 
     def with_loop(self, loop: LoopClosure) -> Self:
@@ -410,9 +408,7 @@ class MechanismData(ResultOwner):
     def _at_no_start(self) -> Self:
         """A copy that shares the results for the model and has none for the start."""
         changed = object.__new__(type(self))
-        for name, value in vars(self).items():
-            object.__setattr__(changed, name, value)
-        object.__setattr__(changed, "_start_results", {})
+        vars(changed).update(vars(self), _start_results={})
         return changed
 
     def __getstate__(self) -> dict[str, Any]:

@@ -513,7 +513,8 @@ class LoopKinematics:
         """
         if self._joint_rows or len(loops) != len(self._loops):
             return None
-        other = copy(self)
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
         other._loops = [
             cast(_LoopRows, rows).moved(loop.name, at_a, at_b)
             for rows, loop, at_a, at_b in zip(self._loops, loops, origins[::2], origins[1::2])

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -572,7 +572,16 @@ class Structure:
     def at(self, mechanism: MechanismData) -> Structure:
         """The same facts with the units of ``mechanism``, which differs in its start only."""
         units = coordinate_units(mechanism, mechanism.q0, mechanism.v0)
-        return self if units is self.units else replace(self, units=units)
+        if units is self.units:
+            return self
+        out = object.__new__(type(self))
+        vars(out).update(vars(self), units=units)
+        return out
+
+    @cached_property
+    def kept_rows(self) -> list[int]:
+        """Numbers of the rows that are kept."""
+        return self.kept.nonzero()[0].tolist()
 
     @property
     def redundant_rows(self) -> tuple[str, ...]:

@@ -249,7 +249,7 @@ class CompiledObservables(Observables):
                 lam, on_b, joints = kernel_system.reactions(
                     all_rows_system,
                     structure.row_scale,
-                    np.flatnonzero(structure.kept).tolist(),
+                    structure.kept_rows,
                     *_states(t, q, v),
                 )
         except ArithmeticError:

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.errors import InputError, known_names, safe_repr
+from srm_mbs.model.copies import copied
 from srm_mbs.model.numbers import vector
 
 _UNTURNED, _IDENTITY = np.eye(3), np.eye(4)
@@ -66,9 +67,7 @@ class Anchor:
 
     def at(self, xyz: tuple[float, float, float]) -> Anchor:
         """The same anchor with another origin (3,) m, finite floats."""
-        out = object.__new__(Anchor)
-        vars(out).update(vars(self), xyz=xyz)
-        return out
+        return copied(self, xyz=xyz)
 
     def resolve(self, model: pin.Model) -> tuple[int, pin.SE3]:
         """Joint that carries the anchor (0: ground) and the anchor's placement in that joint.

@@ -33,6 +33,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
+from srm_mbs.model.copies import copied
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import checked_name, finite_number, finite_numbers, plain, unit_vector
 
@@ -403,9 +404,7 @@ class LoopClosure:
         """The same closure between other places."""
         if self.type != "distance" or self.length is not None:
             _ = self.rows  # in the axes of the anchors, wherever these are: the copy has them, too
-        out = object.__new__(type(self))
-        vars(out).update(vars(self), a=a, b=b)
-        return out
+        return copied(self, a=a, b=b)
 
     @property
     def _element(self) -> str:

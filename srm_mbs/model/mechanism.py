@@ -24,6 +24,7 @@ from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.model.actuators import Actuator, checked_actuators
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.copies import copied
 from srm_mbs.model.drives import Drive, positions
 from srm_mbs.model.forces import ForceElement
 from srm_mbs.model.laws import Curve, Law
@@ -407,9 +408,7 @@ class MechanismData(ResultOwner):
 
     def _at_no_start(self) -> Self:
         """A copy that shares the results for the model and has none for the start."""
-        changed = object.__new__(type(self))
-        vars(changed).update(vars(self), _start_results={})
-        return changed
+        return copied(self, _start_results={})
 
     def __getstate__(self) -> dict[str, Any]:
         """The fields, and the motion of the drives, which may have begun before this state."""

@@ -31,6 +31,9 @@ MOST_DIFFERENT = 0.1
 """Part of the numbers of two limbs that are of another kind in one of them, at most."""
 ZERO, ONE, MINUS_ONE, OTHER = range(4)
 """Codes of numbers."""
+_OF_ANY = frozenset([OTHER])
+"""Codes of numbers that may be any but ``_OF_OTHERS``."""
+_OF_OTHERS = frozenset([0.0, 1.0, -1.0])
 
 
 class Span(NamedTuple):
@@ -211,6 +214,8 @@ class Origin(NamedTuple):
         Numbers of its model.
     rows, constants
         Its rows in use, and their constants; None and empty without effective closures.
+    places
+        Where the parameters have the places of the anchors of its closures.
     structure, parameters
         What :func:`structure_of` gives.
     """
@@ -220,6 +225,7 @@ class Origin(NamedTuple):
     armature: bytes
     rows: DrivenKinematics | None
     constants: Mapping[str, Any]
+    places: list[int]
     structure: Structure
     parameters: FloatArray
 
@@ -229,8 +235,10 @@ class Origin(NamedTuple):
         model, rows = mechanism.model, _rows(mechanism)
         numbers = model.gravity.vector.tobytes(), model.armature.tobytes()
         constants = {} if rows is None else rows.constants()
-        found = structure_of(model, make_system(mechanism).constants())
-        return cls(tree_numbers(model), *numbers, rows, constants, *found)
+        structure, parameters = structure_of(model, make_system(mechanism).constants())
+        ends = [end for closure in structure.closures for end in (closure.at_a, closure.at_b)]
+        places = [place for start, n in ends for place in range(start, start + n)]
+        return cls(tree_numbers(model), *numbers, rows, constants, places, structure, parameters)
 
 
 class UnsupportedElementError(Exception):
@@ -492,14 +500,12 @@ def parameters_of_variant(mechanism: Mechanism, origin: Origin) -> FloatArray | 
     for joint in _differing_rows(tree.bodies, origin.tree.bodies):
         _write(out, structure.motions[joint - 1].inertia, _inertia(tree.bodies[joint].tolist()))
     if rows is not None:
-        ends = [end for closure in structure.closures for end in (closure.at_a, closure.at_b)]
-        for span, place in zip(ends, rows.origins):
-            _write(out, span, place)
+        out[origin.places] = [x for place in rows.origins for x in place]
     # Where a number was 0, a sign or no sign, the structure is another.
     changed = (out != origin.parameters).nonzero()[0]
-    codes, values = np.frombuffer(structure.codes, np.uint8)[changed], out[changed].tolist()
-    other = all(code == OTHER for code in codes.tolist())
-    return out if other and not any(value in (0.0, 1.0, -1.0) for value in values) else None
+    codes = np.frombuffer(structure.codes, np.uint8)[changed].tolist()
+    same = _OF_ANY.issuperset(codes) and _OF_OTHERS.isdisjoint(out[changed].tolist())
+    return out if same else None
 
 
 def _rows(mechanism: Mechanism) -> DrivenKinematics | None:

@@ -212,8 +212,8 @@ def _moved(closure: LoopClosure, places: Mapping[str, Vector]) -> LoopClosure:
 
 def _all_different(closures: Sequence[LoopClosure]) -> bool:
     """Whether no two closures are the same but for their names."""
-    places = {tuple([end.xyz for end in one.anchors]) for one in closures}
-    return len(closures) in (len(places), len({_all_but_name(one) for one in closures}))
+    count, places = len(closures), {tuple([end.xyz for end in one.anchors]) for one in closures}
+    return len(places) == count or len({_all_but_name(one) for one in closures}) == count
 
 
 _all_but_name = attrgetter(*(key.name for key in fields(LoopClosure) if key.name != "name"))

@@ -536,8 +536,7 @@ def _same_rows(rows: DrivenKinematics | None, origin: Origin) -> bool:
 
 def _differing_rows(numbers: FloatArray, others: FloatArray) -> list[int]:
     """Numbers of the joints, but the universe, whose rows differ."""
-    differ = np.logical_or.reduce(numbers != others, axis=1)
-    return [joint for joint in differ.nonzero()[0].tolist() if joint]
+    return sorted({*(numbers != others).nonzero()[0].tolist()} - {0})
 
 
 def _write(parameters: FloatArray, span: Span, values: Sequence[float] | FloatArray) -> None:

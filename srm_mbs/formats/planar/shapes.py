@@ -121,7 +121,8 @@ def outline(points: Sequence[Point]) -> list[tuple[int, int]]:
 
     def turns_left(p: int, a: int, b: int) -> bool:
         (px, py), (ax, ay), (bx, by) = points[p], points[a], points[b]
-        return (ax - px) * (by - py) - (ay - py) * (bx - px) > rounding
+        left: bool = (ax - px) * (by - py) - (ay - py) * (bx - px) > rounding
+        return left
 
     def chain(indices: Iterable[int]) -> list[int]:
         found: list[int] = []

@@ -543,7 +543,10 @@ class LoopClosure:
     @property
     def anchors(self) -> tuple[Anchor, ...]:
         """(a, b), or () for a coupling of joints."""
-        return tuple(anchor for anchor in (self.a, self.b) if anchor is not None)
+        a, b = self.a, self.b
+        if a is not None and b is not None:
+            return a, b
+        return tuple(anchor for anchor in (a, b) if anchor is not None)
 
     @cached_property
     def rows(self) -> RowSet:

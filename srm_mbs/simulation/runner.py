@@ -978,16 +978,15 @@ class FinishedRun:
 
     def _coordinate_sentences(self) -> str:
         """Sentences about the coordinates at the ends of the steps."""
-        output, limited = self.output, _limited_joints(self._mechanism)
+        output = self.output
         if output is not None:
             least, largest, turned = output.least, output.largest, output.over_half_turn
         else:
-            q = least = largest = self.nodes[1][:, : self._system.nq]
-            if limited:
-                # The reductions themselves: their methods cost more than they do here.
-                least, largest = np.minimum.reduce(q), np.maximum.reduce(q)
+            q = self.nodes[1][:, : self._system.nq]
+            # The reductions themselves: their methods cost more than they do here.
+            least, largest = np.minimum.reduce(q), np.maximum.reduce(q)
             turned = over_half_turn(self._mechanism, q)
-        return _limits_left(limited, least, largest) + _half_turns(turned)
+        return _limits_left(self._mechanism, least, largest) + _half_turns(turned)
 
 
 def assemble_result(
@@ -1051,11 +1050,10 @@ def _limited_joints(mechanism: Mechanism) -> list[tuple[str, int, float, float]]
     return limited
 
 
-def _limits_left(
-    limited: list[tuple[str, int, float, float]], least: FloatArray, largest: FloatArray
-) -> str:
-    """A sentence naming those of :func:`_limited_joints` that left their limits, which do not act;
-    ``least`` and ``largest`` (nq,) are the coordinates of all."""
+def _limits_left(mechanism: Mechanism, least: FloatArray, largest: FloatArray) -> str:
+    """A sentence naming the one-degree joints that left their limits, which do not act; ``least``
+    and ``largest`` (nq,) are their coordinates."""
+    limited = _limited_joints(mechanism)
     if not limited:
         return ""
     lows, highs = least.tolist(), largest.tolist()

@@ -211,7 +211,7 @@ class _Parameters:
         """The value of the expression ``text`` of ``key``."""
         if len(text) > LONGEST_EXPRESSION:
             raise InputError(
-                f"the expression {_shown(text)} has more than {LONGEST_EXPRESSION} characters",
+                f"the expression {_quoted(text)} has more than {LONGEST_EXPRESSION} characters",
                 element=key,
                 remedy="Split it into several parameters",
             )
@@ -219,7 +219,7 @@ class _Parameters:
             body = _parsed(text)
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise InputError(
-                f"{_shown(text)} is not an expression",
+                f"{_quoted(text)} is not an expression",
                 element=key,
                 remedy='Write arithmetic, as "=2*crank" or "=sqrt(a**2 + b**2)"',
             ) from error
@@ -244,14 +244,14 @@ class _Parameters:
                 return CONSTANTS[name]
             case ast.Name(id=name) if name in FUNCTIONS:
                 raise InputError(
-                    f"in {_shown(text)} the function {name} has no arguments",
+                    f"in {_quoted(text)} the function {name} has no arguments",
                     element=key,
                     remedy=f"Write {name}(...)",
                 )
             case ast.Name(id=name):
                 if name not in self._table:
                     raise InputError(
-                        f"in {_shown(text)} there is no parameter {name!r}",
+                        f"in {_quoted(text)} there is no parameter {name!r}",
                         element=key,
                         remedy=known_names(self._table),
                     )
@@ -266,7 +266,7 @@ class _Parameters:
                 return self._call(name, values, text, key)
         power = isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitXor)
         raise InputError(
-            f"{_shown(text)} has something else than arithmetic",
+            f"{_quoted(text)} has something else than arithmetic",
             element=key,
             remedy="Write ** for powers"
             if power
@@ -277,7 +277,7 @@ class _Parameters:
     def _call(name: str, arguments: list[float], text: str, key: str) -> float:
         if name not in FUNCTIONS:
             raise InputError(
-                f"in {_shown(text)} there is no function {shortened(name)!r}",
+                f"in {_quoted(text)} there is no function {shortened(name)!r}",
                 element=key,
                 remedy=known_names(FUNCTIONS),
             )
@@ -285,7 +285,7 @@ class _Parameters:
         if not least <= len(arguments) <= most:
             wanted = f"{least}" if least == most else f"at least {least}"
             raise InputError(
-                f"in {_shown(text)} the function {name} has {len(arguments)} arguments",
+                f"in {_quoted(text)} the function {name} has {len(arguments)} arguments",
                 element=key,
                 remedy=f"Give it {wanted}",
             )
@@ -391,14 +391,14 @@ def _parsed(text: str) -> ast.expr:
 _RESERVED = (*CONSTANTS, *FUNCTIONS)
 
 
-def _shown(text: str) -> str:
+def _quoted(text: str) -> str:
     """An expression in messages."""
     return repr(shortened(text))
 
 
 def _no_value(text: str, key: str) -> InputError:
     return InputError(
-        f"{_shown(text)} has no finite value of sensible size",
+        f"{_quoted(text)} has no finite value of sensible size",
         element=key,
         remedy="Correct the expression or the values of its parameters",
     )

@@ -46,7 +46,7 @@ from srm_mbs.formats.urdf.variants import OverridableTree
 from srm_mbs.formats.variants import Elements
 from srm_mbs.formats.xml import parse_xml
 from srm_mbs.model.anchors import Anchor
-from srm_mbs.model.coordinates import write_position, write_positions, write_rate, write_rates
+from srm_mbs.model.coordinates import write_position, write_positions, write_rate
 from srm_mbs.model.forces import ForceElement, Wrench
 from srm_mbs.model.mechanism import SimulationDefaults, Source, VariantMaker
 from srm_mbs.model.numbers import vector_elements
@@ -267,8 +267,9 @@ def unassembled(
     for where, values in (("initial.guess", guess), ("initial.q", q)):
         with naming(element=where):
             write_positions(model, start, values)
-    with naming(element="initial.v"):
-        write_rates(model, np.zeros(model.nv), v)
+    for name, value in v.items():
+        with naming(element="initial.v"):
+            write_rate(model.joints[model.getJointId(name)], np.zeros(model.nv), name, value)
     defaults = description.simulation
     reads = tables and (description.force or description.drive)
     csv = CsvFolder(Path(source.path).parent, source.reach) if reads else None

@@ -87,17 +87,6 @@ def write_positions(model: pin.Model, q: FloatArray, values: Mapping[str, Any]) 
             write_position(model.joints[number], q, name, value)
 
 
-def write_rates(model: pin.Model, v: FloatArray, values: Mapping[str, Any]) -> None:
-    """:func:`write_rate` of all ``values``, joint -> rate, of joints of ``model``."""
-    sizes, places = model.nvs, model.idx_vs
-    for name, value in values.items():
-        number = model.getJointId(name)
-        if type(value) is float and sizes[number] == 1 and math.isfinite(value):
-            v[places[number]] = value
-        else:
-            write_rate(model.joints[number], v, name, value)
-
-
 def set_rate(mechanism: MechanismData, v: FloatArray, name: str, value: Any) -> None:
     """Write the rate ``value`` of joint ``name`` into ``v`` (nv,), in place.
 

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError
 from srm_mbs.integration.generated.code_cache import (
     PATIENCE,
@@ -34,6 +35,7 @@ from srm_mbs.integration.generated.structure import (
     Structure,
     UnsupportedElementError,
     parameters_of_variant,
+    structure_of,
 )
 from srm_mbs.model.mechanism import MechanismData, per_model, per_tree
 
@@ -188,11 +190,11 @@ def structure_of_mechanism(mechanism: Mechanism) -> tuple[Structure, FloatArray]
         if parameters is not None:
             return origin.structure, parameters
     try:
-        origin = Origin.of(mechanism)
+        found = structure_of(mechanism.model, make_system(mechanism).constants())
     except UnsupportedElementError as error:
         raise _not_generated(str(error)) from error
-    known.append(origin)
-    return origin.structure, origin.parameters
+    known.append(Origin.of(mechanism, *found))
+    return found
 
 
 @per_tree

@@ -18,7 +18,6 @@ from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.structure import rows_in_use
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.model.model_data import TreeNumbers, joint_type_data, tree_numbers
 
 ROUNDING = 2.0**-52
@@ -230,15 +229,15 @@ class Origin(NamedTuple):
     parameters: FloatArray
 
     @classmethod
-    def of(cls, mechanism: Mechanism) -> Origin:
-        """``mechanism`` as an origin; raises as :func:`structure_of`."""
+    def of(cls, mechanism: Mechanism, structure: Structure, parameters: FloatArray) -> Origin:
+        """``mechanism`` with its structure as an origin."""
         model, rows = mechanism.model, _rows(mechanism)
         numbers = model.gravity.vector.tobytes(), model.armature.tobytes()
         constants = {} if rows is None else rows.constants()
-        structure, parameters = structure_of(model, make_system(mechanism).constants())
         ends = [end for closure in structure.closures for end in (closure.at_a, closure.at_b)]
         places = [place for start, n in ends for place in range(start, start + n)]
-        return cls(tree_numbers(model), *numbers, rows, constants, places, structure, parameters)
+        tree = tree_numbers(model)
+        return cls(tree, *numbers, rows, constants, places, structure, parameters)
 
 
 class UnsupportedElementError(Exception):

@@ -49,9 +49,15 @@ def bars(tmp_path: Path) -> srm.Mechanism:
     return srm.load(path)
 
 
+def origin(mechanism: srm.Mechanism) -> Origin:
+    """A mechanism as the origin of others."""
+    constants = make_system(mechanism).constants()
+    return Origin.of(mechanism, *structure_of(mechanism.model, constants))
+
+
 def parameters(variant: srm.Mechanism, base: srm.Mechanism) -> np.ndarray | None:
     """The parameters of a variant, found from those of another one."""
-    return parameters_of_variant(variant, Origin.of(base))
+    return parameters_of_variant(variant, origin(base))
 
 
 @pytest.mark.parametrize("values", [{}, {"crank": 0.42}, {"mass": 1.5}, {"crank": 0.3, "mass": 9}])
@@ -60,7 +66,7 @@ def test_parameters_of_a_variant_are_those_of_its_own_structure_to_the_last_bit(
 ) -> None:
     variant = bars.with_parameters(**values)
     structure, expected = structure_of(variant.model, make_system(variant).constants())
-    assert structure == Origin.of(bars).structure
+    assert structure == origin(bars).structure
     found = parameters(variant, bars)
     assert found is not None
     assert np.array_equal(found, expected)
@@ -103,10 +109,10 @@ def test_changes_of_anything_else_are_found(bars: srm.Mechanism) -> None:
         found = parameters(other, bars)
         structure, own = structure_of(other.model, make_system(other).constants())
         if found is not None:
-            assert structure == Origin.of(bars).structure
+            assert structure == origin(bars).structure
             assert np.array_equal(found, own)
         else:
-            assert structure != Origin.of(bars).structure or not np.array_equal(
-                own, Origin.of(bars).parameters
+            assert structure != origin(bars).structure or not np.array_equal(
+                own, origin(bars).parameters
             )
     assert parameters(replace(bars, forces=(wind,)), bars) is None

@@ -10,6 +10,7 @@ Copied = TypeVar("Copied")
 def copied(one: Copied, **changed: Any) -> Copied:
     """A copy of ``one`` with other attributes, without its constructor and its checks, which take
     several times as long; what it computed and keeps as attributes, the copy has, too."""
-    out = object.__new__(type(one))
-    vars(out).update(vars(one), **changed)
+    out, set_ = object.__new__(type(one)), object.__setattr__
+    for name, value in (vars(one) | changed).items():
+        set_(out, name, value)
     return out

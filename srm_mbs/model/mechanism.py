@@ -324,10 +324,12 @@ class MechanismData(ResultOwner):
         """
         made = object.__new__(cls)
         made._forget()
-        vars(made).update(values, _tree_results=tree_results)
+        set_ = object.__setattr__
+        set_(made, "_tree_results", tree_results)
+        for name, value in values.items():
+            set_(made, name, value)
         made._take_start(values["q0"], np.zeros(made.model.nv))
-        loops = tuple(loop.measured(made.model, made.q0) for loop in made.loops)
-        object.__setattr__(made, "loops", loops)
+        set_(made, "loops", tuple(loop.measured(made.model, made.q0) for loop in made.loops))
         return made
 
     def with_loop(self, loop: LoopClosure) -> Self:

@@ -104,13 +104,7 @@ def angle_coordinates(model: pin.Model) -> BoolArray:
 @per_tree
 def rotating_coordinates(mechanism: MechanismData) -> list[int]:
     """The velocity components that are in rad/s."""
-    return np.flatnonzero(_rotating(mechanism)).tolist()
-
-
-@per_tree
-def _rotating(mechanism: MechanismData) -> BoolArray:
-    """The :func:`angle_coordinates`."""
-    return angle_coordinates(mechanism.model)
+    return np.flatnonzero(angle_coordinates(mechanism.model)).tolist()
 
 
 def periodic_coordinates(model: pin.Model) -> BoolArray:
@@ -212,7 +206,8 @@ def keep_units(mechanism: MechanismData, q: FloatArray, diagonal: float) -> None
     if size == 0.0:
         return
     length = diagonal or 1.0
-    coordinate = np.where(_rotating(mechanism), 1.0, length)
+    coordinate = np.full(mechanism.model.nv, length)
+    coordinate[rotating_coordinates(mechanism)] = 1.0
     units = Units(length, coordinate, math.sqrt(size / length))
     _keep_units(mechanism, (gravity, q.tobytes()), units)
 

@@ -14,8 +14,7 @@ import re
 import sys
 import unicodedata
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 __version__ = "0.1.0"
@@ -166,15 +165,22 @@ class InputError(SrmError, ValueError):
         return self
 
 
-@contextmanager
-def naming(*, file: str | None = None, element: str | None = None) -> Iterator[None]:
-    """Fill ``file`` and ``element`` into an :class:`InputError` that names none."""
-    try:
-        yield
-    except InputError as error:
-        error.file = error.file or file
-        error.element = error.element or element
-        raise
+class naming:  # noqa: N801 - used as a function
+    """Fill ``file`` and ``element`` into an :class:`InputError` that names none; a context manager,
+    which a variant enters a dozen times."""
+
+    __slots__ = ("_element", "_file")
+
+    def __init__(self, *, file: str | None = None, element: str | None = None) -> None:
+        self._file, self._element = file, element
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        if isinstance(error, InputError):
+            error.file = error.file or self._file
+            error.element = error.element or self._element
 
 
 class AssemblyError(InputError):

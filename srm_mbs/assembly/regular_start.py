@@ -15,7 +15,7 @@ the interpreter's lock; everything else is left to those two modules.
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
@@ -38,7 +38,7 @@ from srm_mbs.dynamics.constraints.row_algebra import SPARSE_ABOVE
 from srm_mbs.dynamics.constraints.structure import ROUNDING_ROW
 from srm_mbs.dynamics.scaling import RELATIVE_ROUNDING, keep_units, rotating_coordinates
 from srm_mbs.model.coordinates import free_coordinates
-from srm_mbs.model.mechanism import MechanismData, per_tree
+from srm_mbs.model.mechanism import MechanismData, per_model, per_tree
 
 KEPT_FREE = 16
 """Sets of held joints whose free coordinates are kept: variants hold the same."""
@@ -79,6 +79,30 @@ def _free(mechanism: MechanismData, held: tuple[str, ...]) -> list[int]:
     return known[held]
 
 
+class Bodies(NamedTuple):
+    """How far the bodies of a mechanism are from doubts about them.
+
+    Attributes
+    ----------
+    least_inertia
+        The least that a joint moves at the start, over the composite inertia
+        (:func:`~srm_mbs.model.validation.undetermined_joint`).
+    least_gyration, largest_gyration
+        Radii of gyration, over the size of the body and over that of the mechanism
+        (:mod:`~srm_mbs.formats.plausibility`).
+    """
+
+    least_inertia: float
+    least_gyration: float
+    largest_gyration: float
+
+
+@per_model
+def bodies_at_start(mechanism: MechanismData) -> Bodies | None:
+    """Those next to which :func:`regular_start` found a start; None where it found none."""
+    return None
+
+
 def regular_start(
     mechanism: MechanismData,
     start: FloatArray,
@@ -117,6 +141,7 @@ def regular_start(
     )
     if found is None:
         return None
-    q, v, diagonal = found
+    q, v, diagonal, *numbers = found
     keep_units(mechanism, start, diagonal)
+    bodies_at_start.keep(mechanism, Bodies(*numbers))
     return q, v

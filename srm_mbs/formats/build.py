@@ -18,6 +18,7 @@ from srm_mbs.assembly.assemble import consistent_start
 from srm_mbs.assembly.diagnosis import CORRECT_AXIS, inclined_axes
 from srm_mbs.assembly.implied_rows import without_implied_rows
 from srm_mbs.assembly.position import CONSTRAINT_TOLERANCE, limit_springs
+from srm_mbs.assembly.regular_start import Bodies, bodies_at_start
 from srm_mbs.dynamics.constraints.reusable_analysis import ReusableAnalysis
 from srm_mbs.dynamics.constraints.structure import structure_of
 from srm_mbs.dynamics.mechanism import Mechanism
@@ -31,7 +32,12 @@ from srm_mbs.errors import (
     naming,
 )
 from srm_mbs.formats.csv_table import CsvFolder
-from srm_mbs.formats.plausibility import doubtful_angles, doubtful_inertias
+from srm_mbs.formats.plausibility import (
+    LARGEST_GYRATION,
+    SMALLEST_GYRATION,
+    doubtful_angles,
+    doubtful_inertias,
+)
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
 from srm_mbs.formats.toml.parameters import Place
 from srm_mbs.formats.translation import NumbersOfVariants, TreeParts
@@ -172,7 +178,9 @@ def _with_massless_ends(
 def _friction_note(
     model: pin.Model, forces: tuple[ForceElement, ...], friction_speed: float
 ) -> tuple[str, ...]:
-    if not model.friction.any() and not any(getattr(force, "friction", 0.0) for force in forces):
+    if not any(model.friction.tolist()) and not any(
+        getattr(force, "friction", 0.0) for force in forces
+    ):
         return ()
     return (
         "joint friction F acts as F tanh(v/v_s) with v_s = "
@@ -368,6 +376,10 @@ ROTOR_INERTIA = 1e-9
 less than tolerances show, and enough for accelerations to be above rounding."""
 
 
+CLEARLY = 2.0
+"""Factor by which what the kernel computes is beyond a bound, wherever it rounds differently."""
+
+
 def _with_rotors(mechanism: Mechanism) -> tuple[Mechanism, int | None]:
     """The mechanism with rotors on damped joints that move no inertia at the start, and a note; and
     a joint that moves none still, if there is one.
@@ -375,6 +387,9 @@ def _with_rotors(mechanism: Mechanism) -> tuple[Mechanism, int | None]:
     Damping d alone determines the motion along such a direction, as for d -> 0 of the inertia.
     """
     model, source = mechanism.model, mechanism.source
+    bodies = bodies_at_start(mechanism)
+    if bodies is not None and bodies.least_inertia > CLEARLY * ROTOR_INERTIA:
+        return mechanism, None
     armature = np.array(model.armature)
     path = None if source is None else source.urdf_path
     names: list[str] = []
@@ -455,6 +470,14 @@ def _started(
     return started, joint
 
 
+def _are_plausible(bodies: Bodies | None) -> bool:
+    """Whether :func:`doubtful_inertias` has nothing to say, clearly."""
+    return bodies is not None and (
+        bodies.least_gyration > CLEARLY * SMALLEST_GYRATION
+        and CLEARLY * bodies.largest_gyration < LARGEST_GYRATION
+    )
+
+
 def _with_doubts(mechanism: Mechanism, description: Description) -> Mechanism:
     """The mechanism with notes about values that look like those of other units, and about an axis
     that keeps a loop from moving; warnings say the same."""
@@ -462,7 +485,7 @@ def _with_doubts(mechanism: Mechanism, description: Description) -> Mechanism:
     doubts = [
         *doubtful_angles(mechanism, "initial.q", initial.q),
         *doubtful_angles(mechanism, "initial.guess", initial.guess),
-        *doubtful_inertias(mechanism),
+        *(() if _are_plausible(bodies_at_start(mechanism)) else doubtful_inertias(mechanism)),
     ]
     if mechanism.loops and mechanism.degrees_of_freedom == 0 and not mechanism.drives:
         inclined = inclined_axes(mechanism).values()

@@ -34,6 +34,7 @@ from srm_mbs.formats.urdf.override import override, without_overrides
 from srm_mbs.formats.urdf.parser import ROOT_JOINTS
 from srm_mbs.formats.urdf.variants import OverridableTree
 from srm_mbs.formats.variants import VARYING, KnownLinkage
+from srm_mbs.model.copies import copied
 from srm_mbs.model.mechanism import Source, SourceTexts, variant_maker
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array, name_list
 from srm_mbs.model.reach import Reach
@@ -249,7 +250,7 @@ def _of_description(
 
     variants, known = None, None
     if origin is not None:
-        variants, known = replace(origin, overrides=overrides), origin.known
+        variants, known = copied(origin, overrides=overrides), origin.known
         if known is not None and not overrides.entries():
             varied = _varied(known, found, lambda: whole(None)[0].source, variants)
             if varied is not None:
@@ -291,7 +292,7 @@ class _Variants:
     def __call__(self, parameters: Mapping[str, Any]) -> Mechanism:
         values = {**self.overrides.parameters, **given_parameters(parameters)}
         with naming(file=self.own.file):
-            overrides = replace(self.overrides, parameters=values)
+            overrides = copied(self.overrides, parameters=values)
             reading = _of_description(self.own, overrides, self.reach, self.model, self)
             mechanism = assembled(reading)
         variant_maker.keep(mechanism, reading.variants)

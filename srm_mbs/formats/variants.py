@@ -12,7 +12,6 @@ import pinocchio as pin
 from srm_mbs.errors import InputError
 from srm_mbs.formats.toml.description import Description, check_description
 from srm_mbs.formats.toml.parameters import Nested, with_numbers
-from srm_mbs.formats.toml.schema import InitialEntry
 from srm_mbs.formats.translation import KnownTree, NumbersOfVariants, Vector
 from srm_mbs.formats.urdf.variants import OverridableTree, model_with
 from srm_mbs.model.anchors import Anchor
@@ -152,7 +151,7 @@ class KnownLinkage:
     def _starting(self, initial: Mapping[str, Any]) -> Description:
         """The description with the table ``initial``, whose numbers are checked."""
         q, v, guess = (dict(initial.get(part, {})) for part in ("q", "v", "guess"))
-        start = InitialEntry.model_construct(q=q, v=v, guess=guess)
+        start = self.description.initial.model_copy(update={"q": q, "v": v, "guess": guess})
         return self.description.model_copy(update={"initial": start})
 
     def elements(self, entries: Mapping[str, Any]) -> Elements | None:
@@ -213,7 +212,8 @@ def _moved(closure: LoopClosure, places: Mapping[str, Vector]) -> LoopClosure:
 
 def _all_different(closures: Sequence[LoopClosure]) -> bool:
     """Whether no two closures are the same but for their names."""
-    return len(closures) == len({_all_but_name(one) for one in closures})
+    count, places = len(closures), {tuple([end.xyz for end in one.anchors]) for one in closures}
+    return len(places) == count or len({_all_but_name(one) for one in closures}) == count
 
 
 _all_but_name = attrgetter(*(key.name for key in fields(LoopClosure) if key.name != "name"))

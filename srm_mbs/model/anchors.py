@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.errors import InputError, joined_names, known_names, safe_repr
+from srm_mbs.model.copies import copied
 from srm_mbs.model.numbers import vector
 
 _UNTURNED, _IDENTITY = np.eye(3), np.eye(4)
@@ -65,8 +66,8 @@ class Anchor:
         return str(self.link if self.link is not None else self.frame)
 
     def at(self, xyz: tuple[float, float, float]) -> Anchor:
-        """The same anchor with another origin (3,) m."""
-        return Anchor(self.link, self.frame, xyz, self.rpy)
+        """The same anchor with another origin (3,) m, finite floats."""
+        return copied(self, xyz=xyz)
 
     def resolve(self, model: pin.Model) -> tuple[int, pin.SE3]:
         """Joint that carries the anchor (0: ground) and the anchor's placement in that joint.

@@ -33,6 +33,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
+from srm_mbs.model.copies import copied
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import checked_name, finite_number, finite_numbers, plain, unit_vector
 
@@ -403,10 +404,7 @@ class LoopClosure:
         """The same closure between other places."""
         if self.type != "distance" or self.length is not None:
             _ = self.rows  # in the axes of the anchors, wherever these are: the copy has them, too
-        out = object.__new__(type(self))
-        for name, value in (vars(self) | {"a": a, "b": b}).items():
-            object.__setattr__(out, name, value)
-        return out
+        return copied(self, a=a, b=b)
 
     @property
     def _element(self) -> str:
@@ -545,7 +543,10 @@ class LoopClosure:
     @property
     def anchors(self) -> tuple[Anchor, ...]:
         """(a, b), or () for a coupling of joints."""
-        return tuple(anchor for anchor in (self.a, self.b) if anchor is not None)
+        a, b = self.a, self.b
+        if a is not None and b is not None:
+            return a, b
+        return tuple(anchor for anchor in (a, b) if anchor is not None)
 
     @cached_property
     def rows(self) -> RowSet:

@@ -24,6 +24,7 @@ from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.model.actuators import Actuator, checked_actuators
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.copies import copied
 from srm_mbs.model.drives import Drive, positions
 from srm_mbs.model.forces import ForceElement
 from srm_mbs.model.laws import Curve, Law
@@ -252,14 +253,6 @@ def variant_maker(mechanism: MechanismData) -> VariantMaker | None:
     return None
 
 
-@per_model
-def variant_origin(mechanism: MechanismData) -> MechanismData | None:
-    """The mechanism of which this one was made by :meth:`MechanismData.with_parameters`, or of
-    which that one was: much of what follows from both may be the same, which users have to check.
-    None for others."""
-    return None
-
-
 FRICTION_SPEED = 0.01
 """Default of ``friction_speed``, rad/s or m/s."""
 
@@ -417,11 +410,7 @@ class MechanismData(ResultOwner):
 
     def _at_no_start(self) -> Self:
         """A copy that shares the results for the model and has none for the start."""
-        changed = object.__new__(type(self))
-        for name, value in vars(self).items():
-            object.__setattr__(changed, name, value)
-        object.__setattr__(changed, "_start_results", {})
-        return changed
+        return copied(self, _start_results={})
 
     def __getstate__(self) -> dict[str, Any]:
         """The fields, and the motion of the drives, which may have begun before this state."""
@@ -471,7 +460,6 @@ class MechanismData(ResultOwner):
                 "with_parameters, not before",
             )
         made: Self = make(values)
-        variant_origin.keep(made, variant_origin(self) or self)
         return made
 
     @property

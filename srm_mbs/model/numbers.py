@@ -172,6 +172,8 @@ def finite_number(value: Any, name: str, element: str) -> float:
     InputError
         About ``element``, if it is anything else.
     """
+    if _is_finite_float(value):
+        return float(value)
     array = finite_array(value, ())
     if array is None:
         raise InputError(

@@ -178,8 +178,8 @@ class RunData(Protocol):
     output, again
         Of such a run, its output, and a function that makes it again; None otherwise, and if it
         cannot be made again.
-    backend
-        What made the run, as in its settings.
+    backend, controlled
+        What made the run, and whether functions of the user acted, as in its settings.
     bifurcations
         As in :class:`SimulationResult`; None where they have not been looked for.
     attempts, message, stats, settings
@@ -208,6 +208,8 @@ class RunData(Protocol):
     def settings(self) -> Settings: ...
     @property
     def backend(self) -> str: ...
+    @property
+    def controlled(self) -> bool: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +233,10 @@ class KnownRunData:
     @property
     def backend(self) -> str:
         return self.settings.backend
+
+    @property
+    def controlled(self) -> bool:
+        return self.settings.controlled
 
 
 class SimulationResult(RunOutcome):
@@ -636,7 +642,7 @@ class SimulationResult(RunOutcome):
 
     def _need_controller(self, what: str) -> None:
         acting = self._system.controlled or self._system.has_user_forces
-        if self.settings.controlled and not acting:
+        if self._run.controlled and not acting:
             raise InputError(
                 f"the {what} of a loaded run with a controller cannot be computed: "
                 "controllers are not saved",

@@ -863,7 +863,7 @@ class FinishedRun:
         self._record, self._counters = record, counters
         # Before anything reads the dense output, which evaluates stages.
         self._work = self._system.evaluations, self._system.factorisations
-        self._controlled = options.controller is not None or self._system.has_user_forces
+        self.controlled = options.controller is not None or self._system.has_user_forces
         self.output: StreamedOutput | None = None
         self.again: Callable[[], SimulationResult] | None = None
         self._streamed = problem.stream is not None
@@ -872,12 +872,12 @@ class FinishedRun:
             kept = problem.stream.finish(last, record.status is RunStatus.FAILED)
             if isinstance(kept, StreamedOutput):
                 self.steps, self.output = None, kept
-                if not self._controlled:
+                if not self.controlled:
                     repeated = self._options._replace(t_eval=None, backend=self.backend)
                     self.again = partial(run_whole, self._mechanism, repeated, result_type)
             else:
                 self.steps = kept
-        if self._controlled or not isinstance(record, CompiledRecord):
+        if self.controlled or not isinstance(record, CompiledRecord):
             _ = self.message
         record.close()
 
@@ -940,7 +940,7 @@ class FinishedRun:
     @cached_property
     def settings(self) -> Settings:
         return settings(
-            self._options, self._norm, self._controlled, self.backend, self._stiff_intervals
+            self._options, self._norm, self.controlled, self.backend, self._stiff_intervals
         )
 
     @property

@@ -6,13 +6,14 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.assembly import assemble
-from srm_mbs.assembly.regular_start import regular_start
-from srm_mbs.dynamics.scaling import coordinate_units
+from srm_mbs.assembly.regular_start import bodies_at_start, regular_start
+from srm_mbs.dynamics.scaling import coordinate_units, scene_diagonal
 from tests.support.backends import needs_kernel
 from tests.support.bundled import load
 
@@ -68,6 +69,35 @@ def test_units_at_a_start_are_those_of_the_reference(monkeypatch: pytest.MonkeyP
     own, other = (coordinate_units(m, m.q0, m.v0) for m in (by_kernel, reference))
     np.testing.assert_allclose(own.state, other.state, rtol=1e-14)
     np.testing.assert_allclose(own.length, other.length, rtol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["klann_walker", "delta_robot", "watt_six_bar"])
+def test_inertias_and_gyrations_at_a_start_are_those_of_its_mass_matrix_and_bodies(
+    name: str,
+) -> None:
+    mechanism = load(name)
+    model = mechanism.model
+    state = regular_start(mechanism, mechanism.q0, mechanism.v0, (), ())
+    found = bodies_at_start(mechanism)
+    assert state is not None
+    assert found is not None
+    M = np.triu(pin.crba(model, model.createData(), state[0]))
+    M += np.triu(M, 1).T
+    scaled = M / np.sqrt(np.outer(M.diagonal(), M.diagonal()))
+    # What is left of each inertia if all joints behind it in the order are free.
+    left = [1.0 / np.linalg.inv(scaled[k:, k:])[0, 0] for k in range(model.nv)]
+    assert found.least_inertia == pytest.approx(min(left), rel=1e-9)
+    reaches = [[np.linalg.norm(body.lever)] for body in model.inertias]
+    ends = [end for loop in mechanism.loops for end in loop.resolve(model)]
+    ends += [(model.parents[i], model.jointPlacements[i]) for i in range(1, model.njoints)]
+    for joint, placed in ends:
+        reaches[joint].append(np.linalg.norm(placed.translation))
+    moving = [(body, max(own)) for body, own in list(zip(model.inertias, reaches))[1:] if body.mass]
+    radii = [np.sqrt(0.5 * np.trace(body.inertia) / body.mass) for body, _ in moving]
+    sizes = [radius / size for radius, (_, size) in zip(radii, moving)]
+    scene = scene_diagonal(mechanism, mechanism.q0)
+    assert found.least_gyration == pytest.approx(min(sizes), rel=1e-12)
+    assert found.largest_gyration == pytest.approx(max(radii) / scene, rel=1e-12)
 
 
 @pytest.mark.parametrize(

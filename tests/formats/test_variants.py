@@ -301,6 +301,20 @@ def test_a_variant_with_a_fault_is_refused_as_a_load_is(tmp_path: Path) -> None:
         assert refusals[0] == refusals[1]
 
 
+def test_doubts_about_a_variant_are_those_of_a_load(tmp_path: Path) -> None:
+    path = tmp_path / "press.toml"
+    rod = 'points = ["A", "K"]\n'
+    text = PRESS.replace(rod, f'{rod}inertia = "=moment"\n')
+    path.write_text(text.replace("mass = 2.0", "mass = 2.0\nmoment = 0.03"), encoding="utf-8")
+    base = srm.load(path)
+    for moment in (1e6, 1e-9):
+        with pytest.warns(srm.SrmWarning, match="radius of gyration"):
+            variant = base.with_parameters(moment=moment)
+        with pytest.warns(srm.SrmWarning, match="radius of gyration"):
+            fresh = srm.load(path, parameters={"moment": moment})
+        assert variant.notes == fresh.notes != base.notes
+
+
 @pytest.mark.parametrize(
     ("values", "why"),
     [

@@ -344,13 +344,17 @@ struct PySystem {
         std::vector<double> at = to_vector(q);
         double error;
         {
-            const WithoutLock released;
+            // Of few rows this takes less time than another thread needs to take the lock.
+            constexpr int few = 16;
+            std::optional<WithoutLock> released;
+            if (rows > few) released.emplace();
             error = close_loops(*system, algebra, over, unit, limits, at);
         }
         return nb::make_tuple(owned_array(std::move(at)), error);
     }
 
-    // find_regular_start(): q (nq,), v (nv,) and the diagonal; None where it finds none.
+    // find_regular_start(): q (nq,), v (nv,), the diagonal, the least inertia, and the least and the
+    // largest gyration; None where it finds none.
     nb::object regular_start(const StartRules& rules, const Array& q, const Array& v,
                              std::vector<int> free_q, std::vector<int> free_v,
                              std::vector<int> turning, const Array& spreads) {
@@ -371,7 +375,8 @@ struct PySystem {
         }
         if (!is_found) return nb::none();
         return nb::make_tuple(owned_array(std::move(found.q)), owned_array(std::move(found.v)),
-                              found.diagonal);
+                              found.diagonal, found.least_inertia, found.gyrations.least,
+                              found.gyrations.largest);
     }
 
     // ScaledSampler::walk() of as many steps as there are reaches; its samples.

@@ -41,6 +41,46 @@ double System::scene_diagonal(double rounding) const {
     return out > rounding * std::max(farthest, std::sqrt(gyration)) ? out : 0.0;
 }
 
+Gyrations System::gyrations(double diagonal) const {
+    const double infinite = std::numeric_limits<double>::infinity();
+    const auto& model = *work_->model;
+    std::vector<double> sizes(model.njoints);
+    const auto reach = [&](int joint, const auto& at) {
+        sizes[joint] = std::max(sizes[joint], at.norm());
+    };
+    for (int i = 1; i < model.njoints; ++i) {
+        reach(i, model.inertias[i].lever());
+        reach(static_cast<int>(model.parents[i]), model.jointPlacements[i].translation());
+    }
+    for (const ClosureRows& closure : data_.closures) {
+        reach(closure.joint_a, Eigen::Vector3d(closure.at_a.data()));
+        reach(closure.joint_b, Eigen::Vector3d(closure.at_b.data()));
+    }
+    Gyrations out{infinite, 0.0};
+    for (int i = 1; i < model.njoints; ++i) {
+        const double mass = model.inertias[i].mass();
+        const double half_trace = 0.5 * model.inertias[i].inertia().matrix().trace();
+        if (mass == 0.0 && half_trace == 0.0) continue;
+        if (!(mass > 0.0 && half_trace >= 0.0)) return {0.0, infinite};
+        const double gyration = std::sqrt(half_trace / mass);
+        out.least = std::min(out.least, gyration / sizes[i]);
+        out.largest = std::max(out.largest, gyration / diagonal);
+    }
+    return out;
+}
+
+double System::least_inertia(const double* q) {
+    std::vector<double> rows(static_cast<std::size_t>(data_.rows) * nv);
+    rows_and_mass(q, rows.data());
+    const Eigen::MatrixXd M =
+        work_->data.M.selfadjointView<Eigen::Upper>().toDenseMatrix().reverse();
+    const Eigen::VectorXd size = M.diagonal().cwiseSqrt().cwiseInverse();
+    const Eigen::LLT<Eigen::MatrixXd> factors(size.asDiagonal() * M * size.asDiagonal());
+    const Eigen::VectorXd pivots = factors.matrixLLT().diagonal();
+    return factors.info() == Eigen::Success && pivots.allFinite() ? pivots.cwiseAbs2().minCoeff()
+                                                                  : 0.0;
+}
+
 void System::row_blocks(double length, const double* unit, std::vector<RowBlock>& out) const {
     for (const ClosureRows& closure : data_.closures) {
         const int count = static_cast<int>(closure.count());
@@ -247,6 +287,8 @@ bool find_regular_start(System& system, const StartRules& rules, const StartRequ
     out.q.assign(closures.state().data(), closures.state().data() + system.nq);
     u = u.cwiseProduct(closures.unit());
     out.v.assign(u.data(), u.data() + nv);
+    out.least_inertia = system.least_inertia(out.q.data());
+    out.gyrations = system.gyrations(out.diagonal);
     return true;
 }
 

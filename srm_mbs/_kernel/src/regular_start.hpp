@@ -36,10 +36,12 @@ struct StartRequest {
     std::size_t count;
 };
 
-// The state next to a guess, and the diagonal of the scene at the guess (0: all at one point).
+// The state next to a guess, the diagonal of the scene at the guess (0: all at one point),
+// System::least_inertia() in this state, and the gyrations.
 struct RegularStart {
     std::vector<double> q, v;
-    double diagonal = 0.0;
+    double diagonal = 0.0, least_inertia = 0.0;
+    Gyrations gyrations{};
 };
 
 // False where the guess is open, where rows in use depend on each other or nearly do, and where no

@@ -139,6 +139,13 @@ struct ColumnGroups {
 
 enum class RowKind { along, turning, of_joints };
 
+// The least radius of gyration of a body, over the largest distance of its joints, anchors and centre
+// of mass from its origin, and the largest over the diagonal of the scene.  0 and infinite where a
+// body has moments of inertia and no mass.
+struct Gyrations {
+    double least, largest;
+};
+
 // Rows of one closure and one kind.
 struct RowBlock {
     int first, count;
@@ -269,6 +276,10 @@ public:
     // Where the placements were evaluated last, the diagonal of the bounding box of joints, centres of
     // mass and anchors; 0 if it is `rounding` over the distance or the gyration (regular_start.cpp).
     double scene_diagonal(double rounding) const;
+    // The least inertia that a joint moves at q, over the composite inertia: a pivot of M with a unit
+    // diagonal, tips first; 0 if M is not positive definite.
+    double least_inertia(const double* q);
+    Gyrations gyrations(double diagonal) const;
     // The rows that have a usual norm in common, with their units for those of length and of the
     // coordinates (nv,).
     void row_blocks(double length, const double* unit, std::vector<RowBlock>& out) const;

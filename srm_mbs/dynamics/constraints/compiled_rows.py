@@ -197,10 +197,11 @@ class ClosureRows:
 
     def regular_start(
         self, rules: Any, *request: Any
-    ) -> tuple[FloatArray, FloatArray, float] | None:
+    ) -> tuple[FloatArray, FloatArray, float, float, float, float] | None:
         """The consistent state next to a closed and regular guess, see ``find_regular_start``
-        (regular_start.hpp): q (nq,), v (nv,) and the diagonal (m) of the scene at the guess; None
-        where there is none, and without the kernel.
+        (regular_start.hpp): q (nq,), v (nv,), the diagonal (m) of the scene at the guess, the least
+        inertia, and the least and the largest gyration; None where there is none, and without the
+        kernel.
 
         Parameters
         ----------

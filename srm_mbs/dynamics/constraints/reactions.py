@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import accumulate
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import pinocchio as pin
@@ -44,8 +44,8 @@ from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.errors import KnownKeys
-from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import in_order_of_rows
+from srm_mbs.model.mechanism import per_tree
 
 _System = OpenSystem | ClosedSystem
 BLOCK = 1024
@@ -124,9 +124,9 @@ def _block(system: _System, t: FloatArray, q: FloatArray, v: FloatArray) -> Reac
         for j, force in enumerate(data.f):
             inertial[i, j] = force.vector
     wrenches = []
-    for closure, own in zip(closures, _by_closure(closures, lam)):
+    for closure, rows in zip(closures, _names(mechanism).rows):
         if closure.anchors:
-            at_b = np.einsum("nrk,nr->nk", row_wrenches(closure, model, placed), own)
+            at_b = np.einsum("nrk,nr->nk", row_wrenches(closure, model, placed), lam[:, rows])
             on_b = about_origin(at_b, closure, model, placed)
             add_between(loads, bodies_of(closure, model), on_b)
             wrenches.append(at_b)
@@ -151,23 +151,36 @@ def named_reactions(
     joints : (n, njoints, 6)
         Wrenches on the children.
     """
-    drives = in_order_of_rows(mechanism.drives)
-    closures = [*mechanism.loops, *driven_closures(mechanism.drives)]
-    multipliers = _by_closure(closures, lam)
-    between = [loop.name for loop in mechanism.loops if loop.anchors]
-    driven = zip(drives, multipliers[len(mechanism.loops) :])
+    names = _names(mechanism)
+    multipliers = [lam[:, own] for own in names.rows]
+    driven = multipliers[len(names.loops) :]
     return Reactions(
-        KnownKeys(zip(between, on_b)),
-        KnownKeys((c.name, own) for c, own in zip(mechanism.loops, multipliers)),
-        KnownKeys((drive.name, -own[:, 0]) for drive, own in driven),
-        KnownKeys(zip(mechanism.joint_names, np.moveaxis(joints, 1, 0)[1:])),
+        KnownKeys(zip(names.between, on_b)),
+        KnownKeys(zip(names.loops, multipliers)),
+        KnownKeys((drive, -own[:, 0]) for drive, own in zip(names.drives, driven)),
+        KnownKeys(zip(mechanism.joint_names, joints.transpose(1, 0, 2)[1:])),
     )
 
 
-def _by_closure(closures: Sequence[LoopClosure], lam: FloatArray) -> list[FloatArray]:
-    """Columns of ``lam`` (n, rows) of each closure."""
-    counts = [closure.rows.count for closure in closures]
-    return [lam[:, end - own : end] for own, end in zip(counts, accumulate(counts))]
+class _Names(NamedTuple):
+    """Names of the loops, of those between anchors, and of the drives, and the rows of both."""
+
+    loops: list[str]
+    between: list[str]
+    drives: list[str]
+    rows: list[slice]
+
+
+@per_tree
+def _names(mechanism: Mechanism) -> _Names:
+    loops, drives = mechanism.loops, mechanism.drives
+    counts = [closure.rows.count for closure in (*loops, *driven_closures(drives))]
+    return _Names(
+        [loop.name for loop in loops],
+        [loop.name for loop in loops if loop.anchors],
+        [drive.name for drive in in_order_of_rows(drives)],
+        [slice(end - own, end) for own, end in zip(counts, accumulate(counts))],
+    )
 
 
 def _multipliers(

@@ -123,14 +123,15 @@ class ReusableAnalysis:
             If the mass matrix is not positive definite where it is evaluated.
         """
         structure = self.structure
-        if structure.row_names != row_names(mechanism):
+        rows = unscaled_rows.kept(mechanism)
+        lent = rows is not None and rows.idle is self.rows.idle
+        if not lent and structure.row_names != row_names(mechanism):
             return None
         walked = _walked(structure, mechanism)
         if walked is None:
             return None
         lengths, pivot = walked
-        used = structure.kept.tolist()
-        ratios = [a / b for a, b, own in zip(lengths, self.lengths, used) if own]
+        ratios = [lengths[row] / self.lengths[row] for row in structure.kept_rows]
         ratios.append(pivot / self.last_pivot)
         if not (min(ratios) > 1.0 / SIMILAR and max(ratios) < SIMILAR):
             return None
@@ -176,4 +177,4 @@ def _walked(structure: Structure, mechanism: MechanismData) -> tuple[list[float]
 
 def _ranks(pivots: list[list[float]]) -> list[int]:
     """The number of independent rows in each of several configurations."""
-    return [sum(pivot > STRUCTURAL_PIVOT for pivot in own) for own in pivots]
+    return [sum(map(STRUCTURAL_PIVOT.__lt__, own)) for own in pivots]

@@ -40,6 +40,7 @@ from srm_mbs._kernel.workspace import LARGE, workspace
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.copies import copied
 from srm_mbs.model.lazy import cached_property
 
 KEPT_SYSTEMS = 4
@@ -513,15 +514,13 @@ class LoopKinematics:
         """
         if self._joint_rows or len(loops) != len(self._loops):
             return None
-        other = copy(self)
-        other._loops = [
+        moved = [
             cast(_LoopRows, rows).moved(loop.name, at_a, at_b)
             for rows, loop, at_a, at_b in zip(self._loops, loops, origins[::2], origins[1::2])
         ]
-        other.idle = self.idle
-        return other
+        return copied(self, _loops=moved, origins=list(origins))
 
-    @property
+    @cached_property
     def origins(self) -> list[list[float]]:
         """Origins (3,) of the anchors a and b of all closures that have rows, each in the axes of
         its joint."""

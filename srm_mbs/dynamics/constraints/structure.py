@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +40,7 @@ from srm_mbs.dynamics.constraints.row_algebra import (
 from srm_mbs.dynamics.constraints.rows import Elimination, world_jacobian
 from srm_mbs.dynamics.scaling import Units, coordinate_units, row_units
 from srm_mbs.errors import EvaluationError, get_logger
+from srm_mbs.model.copies import copied
 from srm_mbs.model.drives import in_order_of_rows
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model, per_start, per_tree
@@ -155,8 +156,6 @@ class ManifoldSampler:
         rows = unscaled_rows(mechanism)
         self._rows = compiled_rows(mechanism)
         self.closed = len(self.row_unit)
-        # From G to rows over their unit, of coordinates over theirs.
-        self._to_units = units.coordinate / self.row_unit[:, None]
         self.scale = np.ones(len(rows.g))
         self.eliminations: tuple[Elimination, ...] = ()
         pattern = self._pattern = rows.pattern()
@@ -177,6 +176,11 @@ class ManifoldSampler:
     def end(self) -> None:
         """Leave the algebras to the sampler of another variant: this one has no further use."""
         self._idle.append(self._algebras)
+
+    @cached_property
+    def _to_units(self) -> FloatArray:
+        """From G to rows over their unit, of coordinates over theirs."""
+        return self.units.coordinate / self.row_unit[:, None]
 
     @cached_property
     def data(self) -> pin.Data:
@@ -572,7 +576,12 @@ class Structure:
     def at(self, mechanism: MechanismData) -> Structure:
         """The same facts with the units of ``mechanism``, which differs in its start only."""
         units = coordinate_units(mechanism, mechanism.q0, mechanism.v0)
-        return self if units is self.units else replace(self, units=units)
+        return self if units is self.units else copied(self, units=units)
+
+    @cached_property
+    def kept_rows(self) -> list[int]:
+        """Numbers of the rows that are kept."""
+        return self.kept.nonzero()[0].tolist()
 
     @property
     def redundant_rows(self) -> tuple[str, ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from copy import copy
 from functools import lru_cache
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple, Self
@@ -22,6 +21,7 @@ from srm_mbs.formats.planar.shapes import (
 )
 from srm_mbs.formats.toml.schema import LENGTH_UNITS, PlanarBar, PlanarEntry, PlanarSlider
 from srm_mbs.model.anchors import WORLD
+from srm_mbs.model.copies import copied
 from srm_mbs.model.lazy import cached_property
 
 RESERVED = (WORLD, "universe", ROOT_JOINT)
@@ -152,7 +152,7 @@ class Drawing:
     def varied(self, entry: PlanarEntry, change: Change) -> Self | None:
         """The drawing with the numbers of ``entry``, in which nothing but what ``change`` allows
         differs; None where a check may refuse it, or where bodies gain or lose their mass."""
-        out = copy(self)
+        out = copied(self)
         out._draw(entry)
         if not SIZES[0] <= out.size <= SIZES[1] or not out._is_plain(self, change):
             return None

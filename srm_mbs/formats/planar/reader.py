@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from copy import copy
 from dataclasses import replace
 from functools import lru_cache, partial
 from types import MappingProxyType
@@ -66,6 +65,7 @@ from srm_mbs.formats.translation import (
 )
 from srm_mbs.formats.urdf.variants import inertia_as_read
 from srm_mbs.model.anchors import WORLD
+from srm_mbs.model.copies import copied
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
 
@@ -581,8 +581,7 @@ class _Linkage:
         drawing = self.drawing.varied(entry, change)
         if drawing is None:
             return None
-        out = copy(self)
-        out.entry, out.drawing, out.origins = entry, drawing, dict(self.origins)
+        out = copied(self, entry=entry, drawing=drawing, origins=dict(self.origins))
         for joint in self.joints:
             if change.reaches(joint.child, self.point(joint)):
                 out.origins[joint.child] = out._on_body(joint.child, self.point(joint))

@@ -209,10 +209,9 @@ class _Parameters:
 
     def evaluated(self, text: str, key: str) -> float:
         """The value of the expression ``text`` of ``key``."""
-        shown = repr(shortened(text))
         if len(text) > LONGEST_EXPRESSION:
             raise InputError(
-                f"the expression {shown} has more than {LONGEST_EXPRESSION} characters",
+                f"the expression {_quoted(text)} has more than {LONGEST_EXPRESSION} characters",
                 element=key,
                 remedy="Split it into several parameters",
             )
@@ -220,24 +219,24 @@ class _Parameters:
             body = _parsed(text)
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise InputError(
-                f"{shown} is not an expression",
+                f"{_quoted(text)} is not an expression",
                 element=key,
                 remedy='Write arithmetic, as "=2*crank" or "=sqrt(a**2 + b**2)"',
             ) from error
         try:
-            value = self._node(body, shown, key)
+            value = self._node(body, text, key)
         except ArithmeticError as error:
-            raise _no_value(shown, key) from error
+            raise _no_value(text, key) from error
         except ValueError as error:
             if isinstance(error, InputError):
                 raise
-            raise _no_value(shown, key) from error
+            raise _no_value(text, key) from error
         if not abs(value) <= LARGEST_MAGNITUDE:
-            raise _no_value(shown, key)
+            raise _no_value(text, key)
         return value
 
-    def _node(self, node: ast.expr, shown: str, key: str) -> float:
-        """The value of a node of the expression that messages show as ``shown``."""
+    def _node(self, node: ast.expr, text: str, key: str) -> float:
+        """The value of a node of the expression ``text``."""
         match node:
             case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
                 return float(number)
@@ -245,29 +244,29 @@ class _Parameters:
                 return CONSTANTS[name]
             case ast.Name(id=name) if name in FUNCTIONS:
                 raise InputError(
-                    f"in {shown} the function {name} has no arguments",
+                    f"in {_quoted(text)} the function {name} has no arguments",
                     element=key,
                     remedy=f"Write {name}(...)",
                 )
             case ast.Name(id=name):
                 if name not in self._table:
                     raise InputError(
-                        f"in {shown} there is no parameter {name!r}",
+                        f"in {_quoted(text)} there is no parameter {name!r}",
                         element=key,
                         remedy=known_names(self._table),
                     )
                 self.used.add(name)
                 return self._value(name)
             case ast.BinOp(left=left, op=op, right=right) if type(op) in BINARY:
-                return BINARY[type(op)](self._node(left, shown, key), self._node(right, shown, key))
+                return BINARY[type(op)](self._node(left, text, key), self._node(right, text, key))
             case ast.UnaryOp(op=sign, operand=operand) if type(sign) in UNARY:
-                return UNARY[type(sign)](self._node(operand, shown, key))
+                return UNARY[type(sign)](self._node(operand, text, key))
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
-                values = [self._node(each, shown, key) for each in arguments]
-                return self._call(name, values, shown, key)
+                values = [self._node(each, text, key) for each in arguments]
+                return self._call(name, values, text, key)
         power = isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitXor)
         raise InputError(
-            f"{shown} has something else than arithmetic",
+            f"{_quoted(text)} has something else than arithmetic",
             element=key,
             remedy="Write ** for powers"
             if power
@@ -275,10 +274,10 @@ class _Parameters:
         )
 
     @staticmethod
-    def _call(name: str, arguments: list[float], shown: str, key: str) -> float:
+    def _call(name: str, arguments: list[float], text: str, key: str) -> float:
         if name not in FUNCTIONS:
             raise InputError(
-                f"in {shown} there is no function {shortened(name)!r}",
+                f"in {_quoted(text)} there is no function {shortened(name)!r}",
                 element=key,
                 remedy=known_names(FUNCTIONS),
             )
@@ -286,7 +285,7 @@ class _Parameters:
         if not least <= len(arguments) <= most:
             wanted = f"{least}" if least == most else f"at least {least}"
             raise InputError(
-                f"in {shown} the function {name} has {len(arguments)} arguments",
+                f"in {_quoted(text)} the function {name} has {len(arguments)} arguments",
                 element=key,
                 remedy=f"Give it {wanted}",
             )
@@ -392,9 +391,14 @@ def _parsed(text: str) -> ast.expr:
 _RESERVED = (*CONSTANTS, *FUNCTIONS)
 
 
-def _no_value(shown: str, key: str) -> InputError:
+def _quoted(text: str) -> str:
+    """An expression in messages."""
+    return repr(shortened(text))
+
+
+def _no_value(text: str, key: str) -> InputError:
     return InputError(
-        f"{shown} has no finite value of sensible size",
+        f"{_quoted(text)} has no finite value of sensible size",
         element=key,
         remedy="Correct the expression or the values of its parameters",
     )

@@ -37,13 +37,15 @@ from srm_mbs.integration.generated.structure import (
     parameters_of_variant,
     structure_of,
 )
-from srm_mbs.model.mechanism import MechanismData, per_model, variant_origin
+from srm_mbs.model.mechanism import MechanismData, per_model, per_tree
 
 MOST_OPERATIONS = 40_000
 """Statements of generated code: compilation takes about 0.15 ms each, and more for each the more
 there are."""
 KEPT = 256
 """Structures whose code a process keeps."""
+KEPT_ORIGINS = 4
+"""Structures with which variants of one tree are compared."""
 
 
 class CompiledMechanism(NamedTuple):
@@ -182,24 +184,23 @@ def structure_of_mechanism(mechanism: Mechanism) -> tuple[Structure, FloatArray]
     InputError
         If no code can be generated for an element.
     """
-    constants = make_system(mechanism).constants()
-    origin = variant_origin(mechanism)
-    if isinstance(origin, Mechanism):
-        known = _origin(origin)
-        parameters = parameters_of_variant(mechanism.model, constants, known)
+    known = _origins(mechanism)
+    for origin in tuple(known):
+        parameters = parameters_of_variant(mechanism, origin)
         if parameters is not None:
-            return known.structure, parameters
+            return origin.structure, parameters
     try:
-        return structure_of(mechanism.model, constants)
+        found = structure_of(mechanism.model, make_system(mechanism).constants())
     except UnsupportedElementError as error:
         raise _not_generated(str(error)) from error
+    known.append(Origin.of(mechanism, *found))
+    return found
 
 
-@per_model
-def _origin(mechanism: Mechanism) -> Origin:
-    """A mechanism, for the structures of its variants."""
-    constants = make_system(mechanism).constants()
-    return Origin(mechanism.model, constants, *structure_of_mechanism(mechanism))
+@per_tree
+def _origins(mechanism: Mechanism) -> deque[Origin]:
+    """Mechanisms of different structures among the variants of one tree."""
+    return deque(maxlen=KEPT_ORIGINS)
 
 
 def _not_generated(why: str) -> InputError:

@@ -15,7 +15,10 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray, IndexArray
-from srm_mbs.model.model_data import joint_type_data, tree_numbers
+from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
+from srm_mbs.dynamics.constraints.structure import rows_in_use
+from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.model.model_data import TreeNumbers, joint_type_data, tree_numbers
 
 ROUNDING = 2.0**-52
 """Part of a body's moments that is rounding."""
@@ -27,6 +30,9 @@ MOST_DIFFERENT = 0.1
 """Part of the numbers of two limbs that are of another kind in one of them, at most."""
 ZERO, ONE, MINUS_ONE, OTHER = range(4)
 """Codes of numbers."""
+_OF_ANY = frozenset([OTHER])
+"""Codes of numbers that may be any but ``_OF_OTHERS``."""
+_OF_OTHERS = frozenset([0.0, 1.0, -1.0])
 
 
 class Span(NamedTuple):
@@ -199,12 +205,39 @@ class Structure(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """A system whose structure others may have: what :func:`structure_of` took and gave."""
+    """A mechanism whose structure others may have.
 
-    model: pin.Model
+    Attributes
+    ----------
+    tree, gravity, armature
+        Numbers of its model.
+    rows, constants
+        Its rows in use, and their constants; None and empty without effective closures.
+    places
+        Where the parameters have the places of the anchors of its closures.
+    structure, parameters
+        What :func:`structure_of` gives.
+    """
+
+    tree: TreeNumbers
+    gravity: bytes
+    armature: bytes
+    rows: DrivenKinematics | None
     constants: Mapping[str, Any]
+    places: list[int]
     structure: Structure
     parameters: FloatArray
+
+    @classmethod
+    def of(cls, mechanism: Mechanism, structure: Structure, parameters: FloatArray) -> Origin:
+        """``mechanism`` with its structure as an origin."""
+        model, rows = mechanism.model, _rows(mechanism)
+        numbers = model.gravity.vector.tobytes(), model.armature.tobytes()
+        constants = {} if rows is None else rows.constants()
+        ends = [end for closure in structure.closures for end in (closure.at_a, closure.at_b)]
+        places = [place for start, n in ends for place in range(start, start + n)]
+        tree = tree_numbers(model)
+        return cls(tree, *numbers, rows, constants, places, structure, parameters)
 
 
 class UnsupportedElementError(Exception):
@@ -437,62 +470,72 @@ def _comparable(
     return np.array(places)
 
 
-def parameters_of_variant(
-    model: pin.Model, constants: Mapping[str, Any], origin: Origin
-) -> FloatArray | None:
-    """The parameters of a system with the structure of ``origin``; None unless the two differ in
-    placements and inertias of joints of one degree of freedom, and in places of closures, alone,
-    and have neither force elements nor couplings.
+def parameters_of_variant(mechanism: Mechanism, origin: Origin) -> FloatArray | None:
+    """The parameters of a mechanism with the structure of ``origin``, whose tree it has; None
+    unless the two differ in placements and inertias of joints of one degree of freedom, and in
+    places of closures, alone, and have neither force elements nor couplings.
 
     Parameters are :func:`structure_of`'s, which need a tenth of the time where most are the same.
     """
-    structure, own, known = origin.structure, origin.model, origin.constants
-    if len(structure.motions) != model.njoints - 1 or model.njoints != own.njoints:
+    structure, model = origin.structure, mechanism.model
+    if mechanism.forces or structure.forces or structure.bushings or structure.coordinate_rows:
         return None
-    if any(each[key] for each in (constants, known) for key in ("forces", "joint_rows")):
+    if len(structure.motions) != model.njoints - 1 or mechanism.structure.rank != structure.rank:
         return None
-    for key in ("rows", "structural_rank", "coincident", "eliminations"):
-        if constants[key] != known[key]:
-            return None
-    for key in ("damping", "friction"):
-        if (constants[key] is None) != (known[key] is None):
-            return None
-    if model.gravity != own.gravity or (model.armature != own.armature).any():
+    if model.gravity.vector.tobytes() != origin.gravity:
         return None
-    out = origin.parameters.copy()
-    if model.joints.tolist() != own.joints.tolist():
+    if model.armature.tobytes() != origin.armature:
         return None
-    numbers, known_numbers = tree_numbers(model), tree_numbers(own)
-    for joint in _differing_rows(numbers.placements, known_numbers.placements):
-        placement = numbers.placements[joint].tolist()
+    if any(model.damping.tolist() + model.friction.tolist()) != structure.passive:
+        return None
+    rows = _rows(mechanism)
+    if not _same_rows(rows, origin):
+        return None
+    out, tree = origin.parameters.copy(), tree_numbers(model)
+    for joint in _differing_rows(tree.placements, origin.tree.placements):
+        placement = tree.placements[joint].tolist()
         span = structure.motions[joint - 1].placement
         _write(out, span, [*_turn(placement), *placement[9:]])
-    for joint in _differing_rows(numbers.bodies, known_numbers.bodies):
-        _write(out, structure.motions[joint - 1].inertia, _inertia(numbers.bodies[joint].tolist()))
-    if len(constants["loops"]) != len(known["loops"]):
-        return None
-    for rows, others, closure in zip(constants["loops"], known["loops"], structure.closures):
-        for key, value in rows.items():
-            if key in ("at_a", "at_b"):
-                _write(out, getattr(closure, key), value)
-            elif isinstance(value, int):
-                if value != others[key]:
-                    return None
-            elif value is others[key]:  # rows that were moved share it
-                continue
-            elif value.shape != others[key].shape or value.tobytes() != others[key].tobytes():
-                return None
+    for joint in _differing_rows(tree.bodies, origin.tree.bodies):
+        _write(out, structure.motions[joint - 1].inertia, _inertia(tree.bodies[joint].tolist()))
+    if rows is not None:
+        out[origin.places] = [x for place in rows.origins for x in place]
     # Where a number was 0, a sign or no sign, the structure is another.
-    changed = np.flatnonzero(out != origin.parameters)
-    codes = np.frombuffer(structure.codes, dtype=np.uint8)[changed]
-    values = out[changed]
-    same = (codes == OTHER) & (values != 0.0)
-    return out if same.all() and not (np.abs(values) == 1.0).any() else None
+    changed = (out != origin.parameters).nonzero()[0]
+    codes = np.frombuffer(structure.codes, np.uint8)[changed].tolist()
+    same = _OF_ANY.issuperset(codes) and _OF_OTHERS.isdisjoint(out[changed].tolist())
+    return out if same else None
+
+
+def _rows(mechanism: Mechanism) -> DrivenKinematics | None:
+    """The rows in use; None without effective closures."""
+    return rows_in_use(mechanism) if mechanism.structure.rank else None
+
+
+def _same_rows(rows: DrivenKinematics | None, origin: Origin) -> bool:
+    """Whether rows are those of ``origin`` but for the places of their closures."""
+    if rows is None or origin.rows is None:
+        return rows is origin.rows
+    if rows.idle is origin.rows.idle:  # they were moved
+        return True
+    own, known = rows.constants(), origin.constants
+    return (
+        not own["joint_rows"]
+        and own["eliminations"] == known["eliminations"]
+        and len(rows.g) == len(origin.rows.g)
+        and len(own["loops"]) == len(known["loops"])
+        and all(
+            np.array_equal(value, others[key])
+            for closure, others in zip(own["loops"], known["loops"])
+            for key, value in closure.items()
+            if key not in ("at_a", "at_b")
+        )
+    )
 
 
 def _differing_rows(numbers: FloatArray, others: FloatArray) -> list[int]:
     """Numbers of the joints, but the universe, whose rows differ."""
-    return (np.flatnonzero((numbers != others)[1:].any(axis=1)) + 1).tolist()
+    return sorted({*(numbers != others).nonzero()[0].tolist()} - {0})
 
 
 def _write(parameters: FloatArray, span: Span, values: Sequence[float] | FloatArray) -> None:

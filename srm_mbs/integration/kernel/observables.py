@@ -249,12 +249,12 @@ class CompiledObservables(Observables):
                 lam, on_b, joints = kernel_system.reactions(
                     all_rows_system,
                     structure.row_scale,
-                    np.flatnonzero(structure.kept).tolist(),
+                    structure.kept_rows,
                     *_states(t, q, v),
                 )
         except ArithmeticError:
             return super().reactions(t, q, v)  # raises the error that says why
-        return named_reactions(self.mechanism, lam, np.moveaxis(on_b, 1, 0), joints)
+        return named_reactions(self.mechanism, lam, on_b.transpose(1, 0, 2), joints)
 
     def accelerations(self, t: FloatArray, q: FloatArray, v: FloatArray) -> FloatArray:
         if self._calls_python:

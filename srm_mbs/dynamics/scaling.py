@@ -254,8 +254,9 @@ def _diagonal(mechanism: MechanismData, data: pin.Data) -> float:
     """:func:`scene_diagonal` at the placements of ``data``."""
     joints, points = _marked_points(mechanism)
     places = np.array([place.homogeneous for place in data.oMi.tolist()])[joints]
-    corners = places[:, :3, 3] + (places[:, :3, :3] @ points[:, :, None])[:, :, 0]
-    diagonal = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0)))
+    # Without BLAS, which rounds differently on different processors: as the kernel does.
+    corners = places[:, :3, 3] + (places[:, :3, :3] * points[:, None]).sum(axis=2)
+    diagonal = math.sqrt(np.square(corners.max(axis=0) - corners.min(axis=0)).sum())
     farthest = float(np.abs(corners).max())
     known_to = RELATIVE_ROUNDING * max(farthest, _gyration(mechanism))
     return diagonal if diagonal > known_to else 0.0

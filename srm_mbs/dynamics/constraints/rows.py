@@ -519,9 +519,10 @@ class LoopKinematics:
             for rows, loop, at_a, at_b in zip(self._loops, loops, origins[::2], origins[1::2])
         ]
         other.idle = self.idle
+        other.origins = list(origins)
         return other
 
-    @property
+    @cached_property
     def origins(self) -> list[list[float]]:
         """Origins (3,) of the anchors a and b of all closures that have rows, each in the axes of
         its joint."""

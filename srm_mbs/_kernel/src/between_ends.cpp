@@ -13,7 +13,7 @@ namespace {
 // Numbers of ends around a step through which polynomials lead: few first, and the most of them where
 // those are not accurate enough.  In steps of the loosest reruns of the bundled mechanisms they often
 // are not, and more than the most seldom save the evaluations that remain.
-constexpr int few_ends = 10, most_ends = 16;
+constexpr int few_ends = 8, most_ends = 16;
 // Of an end of a step the state and the rates of its coordinates (nx,), and their weights in the
 // polynomial, and in its difference from the one through fewer ends.
 struct WeightedEnd {

@@ -29,8 +29,6 @@ DenseOutput::DenseOutput(int nq, int nv, const std::vector<SchemeDense>& schemes
       steps_(std::move(steps)),
       n_(2 * nv),
       nx_(nq + nv),
-      extra_(steps_.count),
-      polynomials_(steps_.count),
       places_(steps_.count, Place::unknown),
       delta_(n_),
       x_(std::max(nx_, n_)),

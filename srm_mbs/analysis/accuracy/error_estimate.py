@@ -27,7 +27,7 @@ from srm_mbs.simulation.result import SimulationResult
 
 READING_ERROR = 2e-3
 """Largest error of reading a rerun between its steps, over the tolerance of the one before it."""
-READING_PART = 5e-4
+READING_PART = 1e-3
 """The same, over the difference of the run from the tightest one, if that is larger."""
 READING_MARGIN = 5.0
 """Difference of two runs, over that error, below which they are read by dense output."""

@@ -71,7 +71,7 @@ def sampled_ends(part: SimulationResult) -> IndexArray:
         return np.arange(n + 1)
     size = np.zeros((-(-n // length), length))
     if steps.corrections.size:
-        corrections = np.abs(steps.corrections) / part.mechanism.structure.units.state
+        corrections = np.abs(steps.corrections / part.mechanism.structure.units.state)
         size.flat[:n] = corrections.max(axis=1)
     chosen = np.zeros(n + 1, dtype=bool)
     chosen[0] = chosen[n] = True

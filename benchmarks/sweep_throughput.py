@@ -13,9 +13,10 @@ serial sweep, to the last bit.  Of variants, Dask with processes is among them, 
 docs/sweeps.md under which it watches itself less: by default its scheduler, in this process, and
 its workers take a tenth of two cores, busy or idle.  It comes after the others, beside which it
 does not run, in turn with serial sweeps of its own.  Workers have been started, and have run,
-before the clock is.  The repeats go through all executors in turn, and the best of each counts;
-`--seconds` is about what one takes serially.  CPU time over wall time, of this process, says on a
-busy machine whether threads run beside each other.
+before the clock is.  The repeats go through all executors in turn.  Runs per second are those of
+the best repeat of each; ratios are medians over the repeats, of the wall times within one, because
+the speed of the processor changes between them.  `--seconds` is about what one takes serially.  CPU
+time over wall time, of this process, says on a busy machine whether threads run beside each other.
 """
 
 from __future__ import annotations
@@ -61,8 +62,9 @@ WATCHING_LESS = {
 class Row:
     """Throughput of one executor.
 
-    ``of_serial`` is it over that of the serial sweep, ``busy`` CPU time over wall time of this
-    process; of worker processes it is not known.
+    ``runs_per_second`` is that of the best repeat; ``of_serial`` the median of the wall times of
+    the serial sweep over its own, ``busy`` the median of CPU time over wall time of this process;
+    of worker processes that is not known.
     """
 
     t_end: float
@@ -173,7 +175,7 @@ def measure_variants(count: int, repeats: int, workers: list[int], backend: str)
     def measured(rows: list[Measured]) -> list[Row]:
         for *_, chunk, executor in rows:
             run(executor, chunk, cranks[:WARM_UP])
-        return best_of(rows, VARIANT_END, count, repeats, reference, run)
+        return compared(rows, VARIANT_END, count, repeats, reference, run)
 
     with ExitStack() as stack:
         rows: list[Measured] = [SERIAL]
@@ -191,7 +193,7 @@ def measure_variants(count: int, repeats: int, workers: list[int], backend: str)
     return found
 
 
-def best_of(
+def compared(
     rows: list[Measured],
     t_end: float,
     count: int,
@@ -199,16 +201,17 @@ def best_of(
     reference: srm.Sweep,
     run: Callable[[Executor | None, int | None], srm.Sweep],
 ) -> list[Row]:
-    """The best of the ``repeats`` of each executor, in turn, all with the rows of the reference;
-    the first is the serial sweep."""
-    best = [(np.inf, 0.0)] * len(rows)
-    for _ in range(repeats):
+    """Throughput of each executor, of which the first is the serial sweep, over ``repeats`` that go
+    through all of them in turn; all have to give the rows of the reference."""
+    walls, busy = np.empty((repeats, len(rows))), np.empty((repeats, len(rows)))
+    for again in range(repeats):
         for k, (name, _, chunk, executor) in enumerate(rows):
             took, cpu, sweep = timed(lambda e=executor, c=chunk: run(e, c))
             if not same(sweep, reference):
                 raise SystemExit(f"{name}: the rows differ from those of the serial sweep")
-            best[k] = min(best[k], (took, cpu / took))
-    serial = best[0][0]
+            walls[again, k], busy[again, k] = took, cpu / took
+    rates = count / walls.min(axis=0)
+    of_serial = np.median(walls[:, :1] / walls, axis=0)
     return [
         Row(
             t_end,
@@ -216,11 +219,11 @@ def best_of(
             number,
             chunk,
             count,
-            count / took,
-            serial / took,
-            None if name in ("processes", "dask") else busy,
+            float(rates[k]),
+            float(of_serial[k]),
+            None if name in ("processes", "dask") else float(np.median(busy[:, k])),
         )
-        for (name, number, chunk, _), (took, busy) in zip(rows, best)
+        for k, (name, number, chunk, _) in enumerate(rows)
     ]
 
 
@@ -251,7 +254,7 @@ def measure(
         rows = executors(stack, workers)
         for *_, chunk, executor in rows:
             run(WARM_UP, executor, chunk)
-        return best_of(
+        return compared(
             rows, t_end, count, repeats, reference, lambda e, chunk: run(count, e, chunk)
         )
 

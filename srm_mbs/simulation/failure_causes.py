@@ -112,22 +112,26 @@ def _rate_unit(mechanism: Mechanism, joint: str) -> str:
     return "rad/s" if is_angle(mechanism.model, joint) else "m/s"
 
 
-def dead_point(mechanism: Mechanism, q: FloatArray, v: FloatArray) -> FailureCause | None:
-    """The drive that runs into its dead point at ``q`` (nq,) with ``v`` (nv,): its joint is at an
+def dead_point(mechanism: Mechanism, t: float, q: FloatArray) -> FailureCause | None:
+    """The drive that runs into its dead point at ``t`` (s) and ``q`` (nq,): its joint is at an
     extreme position of the motion that the closures and the other drives leave; None if there is
     none.  Drives that do so together are all at theirs: it is that of the fastest.
 
     For mechanisms that are left with one degree of freedom without this drive.  On the curve of
-    their configurations, with the coordinate z, Newton's method finds dq_drive/dz = 0.
+    their configurations, with the coordinate z, Newton's method finds dq_drive/dz = 0.  Rates are
+    those of the laws: that of a joint next to its dead point may have lost its sign.
     """
     drives = [drive for drive in mechanism.drives if drive.joint is not None]
     if len(drives) < len(mechanism.drives):
         return None  # rows of driven points are not among those of the closures
-    rates = v / mechanism.structure.units.coordinate
-    for drive in sorted(
-        drives, key=lambda drive: -abs(float(rates[_coordinate_of(mechanism, drive)]))
-    ):
-        found = _dead_point_of(mechanism, drive, q, float(v[_coordinate_of(mechanism, drive)]))
+    unit = mechanism.structure.units.coordinate
+    rates = {name: curve(t)[1] for name, curve in mechanism.drive_curves.items()}
+
+    def speed(drive: Drive) -> float:
+        return abs(rates[drive.name] / float(unit[_coordinate_of(mechanism, drive)]))
+
+    for drive in sorted(drives, key=speed, reverse=True):
+        found = _dead_point_of(mechanism, drive, q, rates[drive.name])
         if found is not None:
             return found
     return None
@@ -178,9 +182,9 @@ def _dead_point_of(
 
 
 def failure_cause(
-    mechanism: Mechanism, q: FloatArray, v: FloatArray, watch: HeldForceWatch | None
+    mechanism: Mechanism, t: float, q: FloatArray, watch: HeldForceWatch | None
 ) -> FailureCause | None:
-    """The cause of a failure at ``q`` (nq,) and ``v`` (nv,), under the forces that ``watch`` saw;
+    """The cause of a failure at ``t`` (s) and ``q`` (nq,), under the forces that ``watch`` saw;
     None if it is none of those that are known."""
     cause = None if watch is None else watch.cause()
-    return dead_point(mechanism, q, v) if cause is None else cause
+    return dead_point(mechanism, t, q) if cause is None else cause

@@ -254,7 +254,9 @@ def lead_with_cause(problem: Problem, record: RunRecord) -> None:
     if record.status is not RunStatus.FAILED or record.error is not None:
         return
     state = record.run.core.state if isinstance(record, CompiledRecord) else record.last_state
-    cause = failure_cause(problem.mechanism, *problem.system.split(state), problem.held_watch)
+    q, _ = problem.system.split(state)
+    time = record.end_of_steps().time
+    cause = failure_cause(problem.mechanism, time, q, problem.held_watch)
     if cause is not None:
         record.lead_with(cause)
 

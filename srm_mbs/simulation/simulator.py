@@ -213,7 +213,7 @@ class Simulator:
         except ValueError as error:
             raise _bad_force(tau) from error
         except SimulationError as error:
-            cause = failure_cause(self._mechanism, self.q, self.v, self._watch())
+            cause = failure_cause(self._mechanism, self.t, self.q, self._watch())
             if cause is None:
                 raise
             raise _failed(self.t, cause) from error

@@ -178,9 +178,7 @@ def _with_massless_ends(
 def _friction_note(
     model: pin.Model, forces: tuple[ForceElement, ...], friction_speed: float
 ) -> tuple[str, ...]:
-    if not any(model.friction.tolist()) and not any(
-        getattr(force, "friction", 0.0) for force in forces
-    ):
+    if not model.friction.any() and not any(getattr(force, "friction", 0.0) for force in forces):
         return ()
     return (
         "joint friction F acts as F tanh(v/v_s) with v_s = "

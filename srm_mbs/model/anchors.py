@@ -117,8 +117,8 @@ class Anchor:
             names = {f.name for f in model.frames if kind == "frame" or f.type == body}
             names = names - {"universe"} | {WORLD}
             remedy = known_names(sorted(names))
-            if model.existJointName(self.where):
-                joint = model.getJointId(self.where)
+            joint = model.getJointId(self.where)
+            if 0 < joint < model.njoints:
                 moved = [f.name for f in model.frames if f.type == body and f.parentJoint == joint]
                 remedy += f". The joint of this name moves {joined_names(moved)}"
                 if not moved:

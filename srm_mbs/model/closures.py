@@ -543,10 +543,7 @@ class LoopClosure:
     @property
     def anchors(self) -> tuple[Anchor, ...]:
         """(a, b), or () for a coupling of joints."""
-        a, b = self.a, self.b
-        if a is not None and b is not None:
-            return a, b
-        return tuple(anchor for anchor in (a, b) if anchor is not None)
+        return () if self.a is None or self.b is None else (self.a, self.b)
 
     @cached_property
     def rows(self) -> RowSet:

@@ -177,4 +177,4 @@ def _walked(structure: Structure, mechanism: MechanismData) -> tuple[list[float]
 
 def _ranks(pivots: list[list[float]]) -> list[int]:
     """The number of independent rows in each of several configurations."""
-    return [sum(map(STRUCTURAL_PIVOT.__lt__, own)) for own in pivots]
+    return [sum(pivot > STRUCTURAL_PIVOT for pivot in own) for own in pivots]

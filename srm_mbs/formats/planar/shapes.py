@@ -119,25 +119,18 @@ def outline(points: Sequence[Point]) -> list[tuple[int, int]]:
     (left, right), (bottom, top) = ((min(side), max(side)) for side in zip(*points))
     rounding = COLLINEAR * max(right - left, top - bottom) ** 2
 
-    def turns_left(p: int, a: int, b: int) -> bool:
-        (px, py), (ax, ay), (bx, by) = points[p], points[a], points[b]
-        left: bool = (ax - px) * (by - py) - (ay - py) * (bx - px) > rounding
-        return left
-
     def chain(indices: Iterable[int]) -> list[int]:
         found: list[int] = []
         for i in indices:
-            while len(found) > 1 and not turns_left(found[-2], found[-1], i):
+            while len(found) > 1:
+                (px, py), (ax, ay), (bx, by) = points[found[-2]], points[found[-1]], points[i]
+                if (ax - px) * (by - py) - (ay - py) * (bx - px) > rounding:
+                    break
                 found.pop()
             found.append(i)
         return found
 
-    if len(order) == 3:  # as below, in a third of the time
-        first, middle, last = order
-        below, above = turns_left(first, middle, last), turns_left(last, middle, first)
-        ring = [first, *([middle] if below else []), last, *([middle] if above else [])]
-    else:
-        ring = [*chain(order)[:-1], *chain(reversed(order))[:-1]]
+    ring = [*chain(order)[:-1], *chain(reversed(order))[:-1]]
     if len(ring) == 2:
         return [(ring[0], ring[1])]
     return list(zip(ring, [*ring[1:], ring[0]]))

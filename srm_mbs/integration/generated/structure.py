@@ -535,7 +535,7 @@ def _same_rows(rows: DrivenKinematics | None, origin: Origin) -> bool:
 
 def _differing_rows(numbers: FloatArray, others: FloatArray) -> list[int]:
     """Numbers of the joints, but the universe, whose rows differ."""
-    return sorted({*(numbers != others).nonzero()[0].tolist()} - {0})
+    return (np.flatnonzero((numbers != others)[1:].any(axis=1)) + 1).tolist()
 
 
 def _write(parameters: FloatArray, span: Span, values: Sequence[float] | FloatArray) -> None:

@@ -21,6 +21,7 @@ configuration that on the branch of the motion.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Protocol
@@ -35,7 +36,12 @@ from srm_mbs.dynamics.singularities.local_analysis import SingularConfiguration
 from srm_mbs.dynamics.system import SingularityAnalysis, System, Zone
 from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.integration.control.placement import SINGULAR_END_SIGMA
-from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
+from srm_mbs.integration.methods.base import (
+    DelegatingMethod,
+    ErrorNorm,
+    IntegratorState,
+    Method,
+)
 from srm_mbs.integration.methods.branch_nodes import BranchNodes
 from srm_mbs.integration.methods.multiplier_history import WINDOW, MultiplierHistory
 from srm_mbs.integration.methods.near_singular import LARGEST_ZONE_SIGMA
@@ -100,8 +106,7 @@ class Point:
 
 
 class NodeMaker(Protocol):
-    """Makes the nodes of a :class:`BranchMotion`; an implementation by the kernel is in
-    :mod:`srm_mbs.integration.kernel.branch_motion`."""
+    """Makes the nodes of a :class:`BranchMotion`."""
 
     def nodes(
         self,
@@ -133,6 +138,19 @@ class NodeMaker(Protocol):
         state : (nx,) or None
             That of the next node, if the curve is missing or does not reach it.
         """
+
+
+class MakesNodes(ABC):
+    """A system that makes its nodes itself, as one in the kernel does; others take those of the
+    reference."""
+
+    @abstractmethod
+    def node_maker(self, norm: ErrorNorm) -> NodeMaker:
+        """For motions next to a singular configuration."""
+
+    @abstractmethod
+    def branch_nodes(self) -> BranchNodes:
+        """For stages next to a singular configuration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,9 +264,11 @@ class BranchMotion:
         limit: BranchLimit | None = None,
     ) -> BranchMotion:
         """The motion of ``system``, which makes its nodes if it can."""
-        make = getattr(system, "branch_nodes", None)
-        reference = ReferenceNodes(system, analysis, geometry, norm)
-        maker: NodeMaker = reference if make is None else make(norm)
+        maker: NodeMaker
+        if isinstance(system, MakesNodes):
+            maker = system.node_maker(norm)
+        else:
+            maker = ReferenceNodes(system, analysis, geometry, norm)
         curve = None if limit is None else limit.curve()
         return cls(system, analysis, geometry, norm, maker, curve)
 
@@ -507,7 +527,7 @@ def _limit_at_start(
 
 def _uses_nodes(method: Method) -> bool:
     """Whether the steps of ``method`` solve stages by nodes of the branch."""
-    stepper = getattr(method, "stepper", method)
+    stepper = method.stepper if isinstance(method, DelegatingMethod) else method
     return isinstance(stepper, SplitStep) and stepper.uses_nodes
 
 
@@ -523,8 +543,7 @@ def _start_by_nodes(system: System, t: float, state: FloatArray, memory: Integra
     branch_system = system.branch_system
     if branch_system is None:
         return False
-    by_kernel: BranchNodes | None = getattr(system, "stage_nodes", None)
-    nodes = by_kernel or BranchNodes(branch_system)
+    nodes = system.branch_nodes() if isinstance(system, MakesNodes) else BranchNodes(branch_system)
     v = state[-system.multiplier_size :]
     try:
         away = nodes.spaced(t, state, v)

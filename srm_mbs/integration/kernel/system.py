@@ -19,6 +19,7 @@ from srm_mbs.dynamics.system import Zone
 from srm_mbs.integration.kernel.branch_motion import CompiledBranchNodes, CompiledNodes
 from srm_mbs.integration.kernel.marshalling import system_struct
 from srm_mbs.integration.methods.base import ErrorNorm
+from srm_mbs.integration.singular_endpoints import MakesNodes
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 LARGEST_KEPT = 64
@@ -173,7 +174,7 @@ class _KernelTerms:
         return self._found["correction"]  # type: ignore[no-any-return]
 
 
-class Evaluator:
+class Evaluator(MakesNodes):
     """A system whose stages are evaluated by the kernel, if no multiplier is to be predicted.
 
     Parameters
@@ -215,13 +216,10 @@ class Evaluator:
         except ArithmeticError:
             return self.system.impulse_response(q, n)  # raises the error that says why
 
-    def branch_nodes(self, norm: ErrorNorm) -> CompiledNodes:
-        """Makes the nodes of the motion next to a singular configuration."""
+    def node_maker(self, norm: ErrorNorm) -> CompiledNodes:
         return CompiledNodes(self.kernel_system, norm)
 
-    @property
-    def stage_nodes(self) -> CompiledBranchNodes:
-        """Solves stages by nodes of their branch."""
+    def branch_nodes(self) -> CompiledBranchNodes:
         return CompiledBranchNodes(self)
 
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> Any:

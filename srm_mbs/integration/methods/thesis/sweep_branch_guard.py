@@ -19,7 +19,7 @@ from srm_mbs.integration.control.branch_guard import (
     velocity_jumps,
 )
 from srm_mbs.integration.control.step_size import Proposal, StepDecision, StepSizeControl
-from srm_mbs.integration.methods.base import Method, StepResult
+from srm_mbs.integration.methods.base import DelegatingMethod, Method, StepResult
 from srm_mbs.integration.methods.near_singular import AMBIGUOUS_DISTANCE
 from srm_mbs.integration.methods.thesis.iterated_sweeps import IteratedSweeps
 from srm_mbs.integration.methods.thesis.sweep import SweepResult
@@ -151,6 +151,6 @@ def branch_guard(control: StepSizeControl, system: System, method: Method) -> Br
     """The branch guard of a run around ``control``: of a mechanism, or of a DAE, whose states are
     of first order, and with or without sweeps."""
     first_order = system.multiplier_part.start == 0
-    if isinstance(getattr(method, "stepper", None), IteratedSweeps):
+    if isinstance(method, DelegatingMethod) and isinstance(method.stepper, IteratedSweeps):
         return (SweepRateBranchGuard if first_order else SweepBranchGuard)(control, system)
     return (RateBranchGuard if first_order else BranchGuard)(control, system)

@@ -267,6 +267,7 @@ class SimulationResult(RunOutcome):
     """
 
     request: RunOptions | None = None
+    _invariants: Invariants | None = None
 
     def __init__(
         self,
@@ -308,8 +309,7 @@ class SimulationResult(RunOutcome):
     @property
     def backend(self) -> str:
         """Backend of the run: ``settings.backend``, without the rest of the settings."""
-        known = self.__dict__.get("settings")
-        return self._run.backend if known is None else known.backend
+        return self._run.backend
 
     @cached_property
     def _nodes(self) -> tuple[FloatArray, FloatArray]:
@@ -553,20 +553,22 @@ class SimulationResult(RunOutcome):
     def drift(self) -> FloatArray:
         """Closure errors (n, 2): ||g - s|| (m, rad) and ||G v - s'|| (m/s, rad/s), s the motion of
         the drives; all rows, unscaled."""
-        known = self.__dict__.get("invariants")
+        known = self._invariants
         g, c = known[:2] if known else self.observables.closure_errors(self.t, self.q, self.v)
         return np.column_stack([np.linalg.norm(g, axis=1), np.linalg.norm(c, axis=1)])
 
-    @cached_property
+    @property
     def invariants(self) -> Invariants:
         """Closure errors of all rows, unscaled, and energies at ``t``, which take one pass over the
         bodies together."""
-        return self.observables.invariants(self.t, self.q, self.v)
+        if self._invariants is None:
+            self._invariants = self.observables.invariants(self.t, self.q, self.v)
+        return self._invariants
 
     @property
     def energies(self) -> FloatArray:
         """Kinetic and potential energy (n, 2) J."""
-        known = self.__dict__.get("invariants")
+        known = self._invariants
         return known.energies if known else self.observables.energies(self.q, self.v)
 
     @cached_property

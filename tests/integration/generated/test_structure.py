@@ -40,12 +40,17 @@ point = "B"
 along = "=along"
 mass = "=mass"
 """
+DRIVE = """[[planar.drive]]
+pin = "O"
+type = "constant_speed"
+speed = 90.0
+"""
 
 
-@pytest.fixture
-def bars(tmp_path: Path) -> srm.Mechanism:
+@pytest.fixture(params=["", DRIVE], ids=["free", "driven"])
+def bars(request: pytest.FixtureRequest, tmp_path: Path) -> srm.Mechanism:
     path = tmp_path / "bars.toml"
-    path.write_text(BARS, encoding="utf-8")
+    path.write_text(BARS + request.param, encoding="utf-8")
     return srm.load(path)
 
 

@@ -94,7 +94,7 @@ def read_bytes(path: str | os.PathLike[str], largest: int = LARGEST_FILE) -> byt
     return content
 
 
-def read_text(path: str | os.PathLike[str], largest: int = LARGEST_FILE) -> str:
+def read_text(path: str | os.PathLike[str]) -> str:
     """The UTF-8 text of the regular file ``path``, without a byte order mark, with ``\\n`` at the
     ends of lines.
 
@@ -103,7 +103,7 @@ def read_text(path: str | os.PathLike[str], largest: int = LARGEST_FILE) -> str:
     InputError
         As :func:`open_regular`, or if the content is not UTF-8.
     """
-    content = read_bytes(path, largest)
+    content = read_bytes(path)
     try:
         text = content.decode("utf-8-sig")  # Windows editors mark it
     except UnicodeDecodeError as error:
@@ -121,10 +121,10 @@ LONGEST_NAME = 1000
 """Characters of the name of a link, joint, closure ... or file."""
 
 
-def shortened(text: str, longest: int = LONGEST_QUOTE) -> str:
-    """``text`` for a message: on one line, and at most ``longest`` characters of it."""
-    text = " ".join(text[: 4 * longest].split())
-    return text if len(text) <= longest else text[: longest - 3] + "..."
+def shortened(text: str) -> str:
+    """``text`` for a message: on one line, and at most :data:`LONGEST_QUOTE` characters of it."""
+    text = " ".join(text[: 4 * LONGEST_QUOTE].split())
+    return text if len(text) <= LONGEST_QUOTE else text[: LONGEST_QUOTE - 3] + "..."
 
 
 def check_name(text: str, where: str) -> None:

@@ -335,7 +335,7 @@ class PassageAlongCurve:
                 self._found.append((node, energy, float(node.place[-1])))
         self.times = np.array([t for *_, t in self._found])
         self.sigmas = np.array([node.sigma for node, *_ in self._found])
-        motion = [self._motion(*one) for one in self._found]
+        motion = [self._motion(node, energy) for node, energy, _ in self._found]
         self.states = np.array([state for state, _ in motion])
         self.rates = np.array([rate for _, rate in motion])
         self.states[0] = self.state
@@ -473,7 +473,7 @@ class PassageAlongCurve:
             return float(1.0 / (node.tangent[-1] * self.critical.geometry.unit[-1]))
         return float(self._heading * np.sqrt(2.0 * energy / node.inertia))
 
-    def _motion(self, node: Node, energy: float, t: float) -> tuple[FloatArray, FloatArray]:
+    def _motion(self, node: Node, energy: float) -> tuple[FloatArray, FloatArray]:
         """State and tangent rate at a node."""
         q = node.place[:-1] if self._driven else node.place
         rates = self._speed(node, energy) * node.tangent[: self._nv]

@@ -315,19 +315,9 @@ class StepData:
         return list(zip(self.times[edges[::2]].tolist(), self.times[edges[1::2]].tolist()))
 
     @property
-    def ends_stiff(self) -> bool:
-        """Whether the last step was stiff."""
-        return len(self.stiff) > 0 and bool(self.stiff[-1] > 0.0)
-
-    @property
     def end(self) -> float:
         """End of the run (s)."""
         return float(self.times[-1]) if self.stop is None else self.stop
-
-    @property
-    def last_length(self) -> float:
-        """Length (s) of the last step, 0 without any."""
-        return float(self.times[-1] - self.times[-2]) if self.count else 0.0
 
     @property
     def count(self) -> int:

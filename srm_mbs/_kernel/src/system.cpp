@@ -509,19 +509,10 @@ int System::resolve_laws() {
     return nv;
 }
 
-// Damping and friction as joined laws.
-void System::passive_joined() {
-    for (int i = 0; i < nv; ++i) {
-        joined_[i] = data_.damping.empty() ? 0.0 : -data_.damping[i] * v_[i];
-        if (!data_.friction.empty())
-            joined_[i] -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
-    }
-}
-
 // The forces of joined laws, or what acts in their place, and those of the other elements.
 void System::joined_forces(double t, const double* q) {
     auto& w = *work_;
-    passive_joined();
+    for (int i = 0; i < nv; ++i) joined_[i] = passive_force(i);
     add_forces(lawful_, data_.coincident, w, t, q, v_.data(), bushings_, joined_.data(), nullptr);
     add_forces(lawless_, data_.coincident, w, t, q, v_.data(), bushings_, f_.data(), nullptr);
     const double* acting = laws_.applied ? laws_.applied : joined_.data();
@@ -597,11 +588,7 @@ void System::passive_forces() {
     for (int i = 0; i < nv; ++i) {
         const int law = laws_.of_coordinate(i);
         if (law < 0) continue;
-        double force = 0.0;
-        if (!data_.damping.empty()) force -= data_.damping[i] * v_[i];
-        if (!data_.friction.empty())
-            force -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
-        laws_.values[law] = force;
+        laws_.values[law] = passive_force(i);
         if (laws_.applied) f_[i] += laws_.applied[law];
     }
 }
@@ -724,7 +711,7 @@ void System::generated_terms(double t, const double* state, ForceLaws* laws) {
         for (int row = 0; row < data_.rows; ++row) columns_of_rows_[row] = column(row);
     const bool joined = laws && !joined_.empty();
     if (joined) {
-        passive_joined();
+        for (int i = 0; i < nv; ++i) joined_[i] = passive_force(i);
         laws = nullptr;
     }
     double* const lawful = joined ? joined_.data() : f_.data();
@@ -783,7 +770,7 @@ void System::coordinate_forces(double t, const double* state) {
 
 void System::applied_forces(double t, const double* state, double* out) {
     auto& w = *work_;
-    t = std::min(std::max(t, first_), last_);
+    t = std::clamp(t, first_, last_);
     coordinate_forces(t, state);
     if (!data_.forces.empty()) {
         if (on_several_) {
@@ -845,7 +832,15 @@ void System::acceleration_of(double* r, const double* c) {
     projection_->unwhiten(r);
 }
 
-// The derivative of damping and friction of a coordinate by its rate.
+// Damping and friction of a coordinate.
+double System::passive_force(int i) const {
+    double out = 0.0;
+    if (!data_.damping.empty()) out -= data_.damping[i] * v_[i];
+    if (!data_.friction.empty()) out -= data_.friction[i] * std::tanh(v_[i] / data_.friction_speed);
+    return out;
+}
+
+// Its derivative by the rate.
 double System::passive_slope(int i) const {
     double out = data_.damping.empty() ? 0.0 : -data_.damping[i];
     if (data_.friction.empty()) return out;
@@ -855,7 +850,7 @@ double System::passive_slope(int i) const {
 
 // Adds to Dr_ what the controller contributes.
 void System::controller_by_state(double t, const double* state, const std::vector<double>& steps) {
-    t = std::min(std::max(t, first_), last_);
+    t = std::clamp(t, first_, last_);
     std::vector<double> x(nq + nv), delta(2 * nv), here(nv);
     controller_(t, state, state + nq, here.data());
     for (int j = 0; j < 2 * nv; ++j) {
@@ -971,7 +966,7 @@ void System::joined_laws_by_state(const double* state, const double* a, double* 
 
 void System::evaluate(double t, const double* state, const ZoneView& zone) {
     ++evaluations;
-    t = std::min(std::max(t, first_), last_);
+    t = std::clamp(t, first_, last_);
     if (!(distance(state, nq + nv) < overflow)) throw EvaluationError{Failure::not_finite};
     auto& w = *work_;
     std::copy(state, state + nq, w.q.data());
@@ -979,38 +974,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     coordinate_forces(t, state);
     ForceLaws* const laws = tracks_laws_ ? &laws_ : nullptr;
     const bool joined = laws && !joined_.empty();
-    if (!closed_ && code_ && (!laws || nv <= one_pass_size)) {
-        generated_terms(t, state, laws);
-        factorise_mass();
-        std::copy(f_.begin(), f_.end(), rate_.begin());
-        lu_solve(factors_.data(), nv, pivots_.data(), rate_.data());
-        if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
-        return;
-    }
-    if (!closed_ && laws && nv <= one_pass_size) {
-        // The one pass over the tree that closures have costs less than three.
-        pinocchio_model::compute_terms(w);
-        for (int i = 0; i < nv; ++i) rate_[i] = f_[i] - w.data.nle[i];
-        add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, rate_.data(),
-                       laws);
-        factorise_mass();
-        lu_solve(factors_.data(), nv, pivots_.data(), rate_.data());
-        if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
-        return;
-    }
-    if (!closed_) {
-        if (!data_.forces.empty()) {
-            pinocchio_model::move_bodies(w);
-            pinocchio::computeJointJacobians(*w.model, w.data);
-            add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
-                       laws);
-        }
-        std::copy(f_.begin(), f_.end(), w.tau.data());
-        pinocchio::aba(*w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
-        std::copy(w.data.ddq.data(), w.data.ddq.data() + nv, rate_.begin());
-        if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
-        return;
-    }
+    if (!closed_) return evaluate_open(t, state, laws);
     if (code_) {
         generated_terms(t, state, laws);
     } else {
@@ -1034,6 +998,36 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     if (zone.history->normal_count() < p.structural_rank - p.rank)
         throw EvaluationError{Failure::no_branch};
     p.hold(zone.history->normals.data(), zone.history->normal_count());
+}
+
+// The accelerations without closures.
+void System::evaluate_open(double t, const double* state, ForceLaws* laws) {
+    auto& w = *work_;
+    if (laws ? nv <= one_pass_size : code_ != nullptr) {
+        if (code_) {
+            generated_terms(t, state, laws);
+            std::copy(f_.begin(), f_.end(), rate_.begin());
+        } else {
+            // The one pass over the tree that closures have costs less than three.
+            pinocchio_model::compute_terms(w);
+            for (int i = 0; i < nv; ++i) rate_[i] = f_[i] - w.data.nle[i];
+            add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_,
+                       rate_.data(), laws);
+        }
+        factorise_mass();
+        lu_solve(factors_.data(), nv, pivots_.data(), rate_.data());
+    } else {
+        if (!data_.forces.empty()) {
+            pinocchio_model::move_bodies(w);
+            pinocchio::computeJointJacobians(*w.model, w.data);
+            add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
+                       laws);
+        }
+        std::copy(f_.begin(), f_.end(), w.tau.data());
+        pinocchio::aba(*w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
+        std::copy(w.data.ddq.data(), w.data.ddq.data() + nv, rate_.begin());
+    }
+    if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
 }
 
 // The part of a multiplier of the rows in use, in white coordinates, plus (1 - P) yhat_pred.
@@ -1280,8 +1274,8 @@ void System::difference(const double* start, const double* end, const double* ne
     from = Eigen::Map<const Eigen::VectorXd>(moved.data(), nq);
     pinocchio::difference(*w.model, from, to, step);
     for (int i = 0; i < nv; ++i) out[i] += step[i];
-    constexpr double turn = 2.0 * EIGEN_PI;
-    for (int i : data_.wrapped_angles) out[i] += turn * std::nearbyint((near[i] - out[i]) / turn);
+    for (int i : data_.wrapped_angles)
+        out[i] += two_pi * std::nearbyint((near[i] - out[i]) / two_pi);
 }
 
 void System::chart_rate(const double* delta, const double* rate, double* out) const {
@@ -1530,7 +1524,7 @@ void System::closures_at(double t, const double* q, double* g, double* G, int wi
 
 void System::write_rows(double t, const double* q, double* G, int width) {
     auto& w = *work_;
-    t = std::min(std::max(t, first_), last_);
+    t = std::clamp(t, first_, last_);
     std::copy(q, q + nq, w.q.data());
     pinocchio::computeJointJacobians(*w.model, w.data, Argument(w.q));
     update_closures(q, false);

@@ -286,22 +286,21 @@ public:
     // The coordinates that their differences may move together.
     const ColumnGroups& column_groups();
     int rows() const { return data_.rows; }
-    // With all terms of other states lost: of one state g - s and G v - s' (rows,), and the kinetic
-    // and the potential energy, of gravity and of springs; of n states the powers (n, forces) of
-    // `each` element at the rates of the state or, if it is `resting`, those of its force at rest.
-    // there: whether the bodies are at this state already, from closure_errors().  stage_powers: the
-    // same (chosen, stages, forces) at stages of the `chosen` steps.
+    // With all terms of other states lost, up to stage_powers(): g - s and G v - s' (rows,).
     void closure_errors(double t, const double* state, double* g, double* rates);
+    // The kinetic and the potential energy, of gravity and of springs.  there: whether the bodies are
+    // at this state already, from closure_errors().
     std::array<double, 2> energies(const double* state, bool there = false);
+    // Of n states the powers (n, elements) of each element at the rates of the state or, if it is
+    // `resting`, those of its force at rest; the same (chosen, stages, elements) at stages of the
+    // `chosen` steps.
     void powers(const double* t, const double* states, std::size_t n,
                 const SeparateElements& elements, bool resting, double* out);
     void stage_powers(const std::vector<long>& chosen, const StageArrays& steps,
                       const SeparateElements& elements, double* out);
     SeparateElements separate(const std::vector<ForceElement>& elements) const;
-    // Of the stage evaluated last: M x (nv,), all forces but those of closures (nv,), those among
-    // them but those of inertia (nv,), and Gdot v - s'' (rows,).
-    // Also then, in the order of the drives: the forces on their coordinates; false where rows
-    // depend on each other, which leaves the forces open.
+    // Of the stage evaluated last, in the order of the drives, the forces on their coordinates; false
+    // where rows depend on each other, which leaves the forces open.
     bool drive_forces(double* out);
     // The forces within the mechanism at the stage of `state` at t, evaluated last; `all`, a system of
     // the same model, has all rows, whose scales are `scale` (rows,).  Multipliers (rows,) of all
@@ -314,6 +313,8 @@ public:
                    double* joints);
     std::size_t closure_count() const { return data_.closures.size(); }
     int joint_count() const;
+    // Of the stage evaluated last: M x (nv,), all forces but those of closures (nv,), those among
+    // them but those of inertia (nv,), and Gdot v - s'' (rows,).
     void mass_times(const double* x, double* out) const;
     void working_forces(double* all, double* working);
     const std::vector<double>& bias() const { return bias_; }
@@ -393,21 +394,24 @@ private:
     void completed(const double* white, double* out) const;
     const double* held_force(double t) const;
 
-    double first_ = -std::numeric_limits<double>::infinity();
-    double last_ = std::numeric_limits<double>::infinity();
+    void find_friction();
+    void evaluate_open(double t, const double* state, ForceLaws* laws);
     void passive_forces();
     void coordinate_forces(double t, const double* state);
     void joined_forces(double t, const double* q);
     void joined_values();
     void factorise_mass();
     void generated_terms(double t, const double* state, ForceLaws* laws);
-    void passive_joined();
     void acceleration_of(double* r, const double* c);
+    double passive_force(int i) const;
     double passive_slope(int i) const;
     void generated_derivatives(const double* state, const double* a, const double* lam,
                                const double* applied);
     void joined_laws_by_state(const double* state, const double* a, double* out);
     void controller_by_state(double t, const double* state, const std::vector<double>& steps);
+
+    double first_ = -std::numeric_limits<double>::infinity();  // times (s) within which it evaluates
+    double last_ = std::numeric_limits<double>::infinity();
     const GeneratedTerms* code_ = nullptr;
     std::unique_ptr<Projection> other_projection_;  // that with generated algebra, or without it
     GeneratedProjection* by_code_ = nullptr;        // the one in use, if its algebra is generated
@@ -418,8 +422,6 @@ private:
     // Of generated derivatives, column by column: residuals by (q, v, laws), rows and laws by (q, v),
     // laws of coordinates by their own.
     std::vector<double> turns_, multipliers_, Dr_, Dc_, Dl_, Dq_, Dv_;
-    void find_friction();
-
     std::vector<FrictionSum> friction_sums_;
     ForceLaws laws_;
     // Elements with laws, and the others, where the laws are joined.

@@ -114,8 +114,8 @@ class Evaluator(ABC):
 
     @abstractmethod
     def constants(self) -> dict[str, Any] | None:
-        """Constants for the compiled kernel, of which ``kind`` numbers the kinds as forces.hpp
-        does; None for functions of the user, which the kernel calls."""
+        """Constants for the compiled kernel, of which ``kind`` is that of forces.hpp; None for
+        functions of the user, which the kernel calls."""
 
 
 class LawEvaluator(Evaluator):
@@ -306,7 +306,7 @@ class SpringDamperEvaluator(LawEvaluator):
     def constants(self) -> dict[str, Any]:
         own = {"numbers": np.array([self.slack])} if self.slack else {}
         return {
-            "kind": 0,
+            "kind": "spring_damper",
             "a": self.a.constants(),
             "b": self.b.constants(),
             "support": self.support,
@@ -321,7 +321,7 @@ class WrenchEvaluator(Evaluator):
 
     def __init__(self, model: pin.Model, force: Wrench) -> None:
         self.at = ResolvedAnchor(model, force.at)
-        self.turns = force.frame == "link"
+        self.in_link_axes = force.frame == "link"
         self.wrench = ValuesOverTime([*force.force, *force.moment], force.law)
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
@@ -331,16 +331,16 @@ class WrenchEvaluator(Evaluator):
         at = self.at.placement(data)
         numbers = self.wrench.at(t)
         force, moment = numbers[:3], numbers[3:]
-        if self.turns:
+        if self.in_link_axes:
             force, moment = at.rotation @ force, at.rotation @ moment
         return LinkWrench(self.at.joint, 0, wrench_at(at.translation, force, moment))
 
     def constants(self) -> dict[str, Any]:
         return {
-            "kind": 3,
+            "kind": "wrench",
             "a": self.at.constants(),
             "support": self.at.support,
-            "turns": self.turns,
+            "in_link_axes": self.in_link_axes,
         } | self.wrench.constants()
 
 
@@ -473,7 +473,7 @@ class BushingEvaluator(LawEvaluator):
 
     def constants(self) -> dict[str, Any]:
         return {
-            "kind": 4,
+            "kind": "bushing",
             "a": self.a.constants(),
             "b": self.b.constants(),
             "support": self.support,
@@ -564,23 +564,11 @@ class JointTorqueEvaluator(Evaluator):
         tau[self.own] += self.torque.at(t)
 
     def constants(self) -> dict[str, Any]:
-        return {"kind": 1, "in_v": self.own.start} | self.torque.constants()
-
-
-def _of_coordinate(
-    element: TorsionSpringEvaluator | LimitSpringEvaluator, data: pin.Data
-) -> list[Coefficient]:
-    """The coefficients of an element on one coordinate."""
-    direction = np.zeros(data.M.shape[0])
-    direction[element.in_v] = 1.0
-    angular = bool(np.abs(world_jacobian(data)[3:, element.in_v]).max() > 0.0)
-    return _along_direction(element, direction, angular)
+        return {"kind": "joint_torque", "in_v": self.own.start} | self.torque.constants()
 
 
 def _along_direction(
-    element: TorsionSpringEvaluator | LimitSpringEvaluator | CouplingSpringEvaluator,
-    direction: FloatArray,
-    angular: bool,
+    element: CoordinateEvaluator | CouplingSpringEvaluator, direction: FloatArray, angular: bool
 ) -> list[Coefficient]:
     """The coefficients of an element that acts along one ``direction`` (nv,)."""
     return [
@@ -590,13 +578,39 @@ def _along_direction(
     ]
 
 
-class TorsionSpringEvaluator(Evaluator):
-    """A :class:`~srm_mbs.model.forces.TorsionSpring`, resolved against a model."""
+class CoordinateEvaluator(Evaluator):
+    """A spring and damper on one coordinate, whose force is the law of the coordinate."""
 
-    def __init__(self, model: pin.Model, force: TorsionSpring) -> None:
+    kind: str
+
+    def __init__(self, model: pin.Model, force: TorsionSpring | LimitSpring) -> None:
         joint = model.joints[model.getJointId(force.joint)]
         self.in_q, self.in_v = joint.idx_q, joint.idx_v
         self.stiffness, self.damping = force.stiffness, force.damping
+
+    def coefficients(self, data: pin.Data) -> list[Coefficient]:
+        direction = np.zeros(data.M.shape[0])
+        direction[self.in_v] = 1.0
+        angular = bool(np.abs(world_jacobian(data)[3:, self.in_v]).max() > 0.0)
+        return _along_direction(self, direction, angular)
+
+    def constants(self) -> dict[str, Any]:
+        return {
+            "kind": self.kind,
+            "in_q": self.in_q,
+            "in_v": self.in_v,
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+        }
+
+
+class TorsionSpringEvaluator(CoordinateEvaluator):
+    """A :class:`~srm_mbs.model.forces.TorsionSpring`, resolved against a model."""
+
+    kind = "torsion_spring"
+
+    def __init__(self, model: pin.Model, force: TorsionSpring) -> None:
+        super().__init__(model, force)
         self.rest_angle = force.rest_angle
 
     def add(self, tau: FloatArray, data: pin.Data, q: FloatArray, v: FloatArray, t: float) -> None:
@@ -606,18 +620,8 @@ class TorsionSpringEvaluator(Evaluator):
     def energy(self, data: pin.Data, q: FloatArray) -> float:
         return 0.5 * self.stiffness * float(q[self.in_q] - self.rest_angle) ** 2
 
-    def coefficients(self, data: pin.Data) -> list[Coefficient]:
-        return _of_coordinate(self, data)
-
     def constants(self) -> dict[str, Any]:
-        return {
-            "kind": 2,
-            "in_q": self.in_q,
-            "in_v": self.in_v,
-            "stiffness": self.stiffness,
-            "damping": self.damping,
-            "rest": self.rest_angle,
-        }
+        return super().constants() | {"rest": self.rest_angle}
 
 
 class CouplingSpringEvaluator(LawEvaluator):
@@ -686,7 +690,7 @@ class CouplingSpringEvaluator(LawEvaluator):
         acts = self.slack or self.friction
         own = {"numbers": np.array([self.slack, self.friction, self.speed])} if acts else {}
         return {
-            "kind": 6,
+            "kind": "coupling_spring",
             "support": self.along(),
             "positions": self.in_q.tolist(),
             "stiffness": self.stiffness,
@@ -695,13 +699,13 @@ class CouplingSpringEvaluator(LawEvaluator):
         } | own
 
 
-class LimitSpringEvaluator(Evaluator):
+class LimitSpringEvaluator(CoordinateEvaluator):
     """A :class:`~srm_mbs.model.forces.LimitSpring`, resolved against a model."""
 
+    kind = "limit_spring"
+
     def __init__(self, model: pin.Model, force: LimitSpring) -> None:
-        joint = model.joints[model.getJointId(force.joint)]
-        self.in_q, self.in_v = joint.idx_q, joint.idx_v
-        self.stiffness, self.damping = force.stiffness, force.damping
+        super().__init__(model, force)
         self.lower, self.upper, self.depth = force.resolved(model)
 
     def _beyond(self, q: FloatArray) -> float:
@@ -723,18 +727,8 @@ class LimitSpringEvaluator(Evaluator):
         inside = depth**2 * x**5 * (2.0 + x * (6.0 / 7.0 * x - 2.5))
         return self.stiffness * (inside + 0.5 * max(beyond**2 - depth**2, 0.0))
 
-    def coefficients(self, data: pin.Data) -> list[Coefficient]:
-        return _of_coordinate(self, data)
-
     def constants(self) -> dict[str, Any]:
-        return {
-            "kind": 5,
-            "in_q": self.in_q,
-            "in_v": self.in_v,
-            "stiffness": self.stiffness,
-            "damping": self.damping,
-            "numbers": np.array([self.lower, self.upper, self.depth]),
-        }
+        return super().constants() | {"numbers": np.array([self.lower, self.upper, self.depth])}
 
 
 class _UserForceEvaluator(Evaluator):
@@ -779,7 +773,7 @@ _EVALUATORS = {
 }
 
 
-_LAWFUL = LawEvaluator | TorsionSpringEvaluator | LimitSpringEvaluator
+_LAWFUL = LawEvaluator | CoordinateEvaluator
 
 
 @per_model
@@ -953,8 +947,7 @@ class ForceKinematics:
 
     def coordinates(self) -> list[int]:
         """Velocity indices of the coordinates on which springs and limits act."""
-        kinds = TorsionSpringEvaluator | LimitSpringEvaluator
-        return [e.in_v for e in self._elements if isinstance(e, kinds)]
+        return [e.in_v for e in self._elements if isinstance(e, CoordinateEvaluator)]
 
     def laws(
         self,
@@ -967,7 +960,7 @@ class ForceKinematics:
         :meth:`generalised`."""
         along = np.zeros(self._nv)
         for element in self._elements:
-            if isinstance(element, TorsionSpringEvaluator | LimitSpringEvaluator):
+            if isinstance(element, CoordinateEvaluator):
                 element.add(along, data, q, v, 0.0)
         between = [e for e in self._elements if isinstance(e, LawEvaluator)]
         return along, [e.laws(data, q, v, step.get(e)) for e in between]
@@ -1020,7 +1013,7 @@ class ForceKinematics:
         tau = np.zeros(self._nv)
         first = 0
         for element in self._elements:
-            if isinstance(element, TorsionSpringEvaluator | LimitSpringEvaluator):
+            if isinstance(element, CoordinateEvaluator):
                 continue
             if isinstance(element, LawEvaluator):
                 values = applied[first : first + element.law_count]

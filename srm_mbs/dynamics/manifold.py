@@ -174,7 +174,7 @@ def _chart_constants(mechanism: MechanismData) -> dict[str, Any]:
         "position_of": _vector_coordinates(mechanism).tolist(),
         "groups": [(j.group, j.start, j.size, j.position) for j in groups],
         "series": np.array(SERIES),
-        "turning": _angle_pairs(mechanism).tolist(),
+        "wrapped_angles": _angle_pairs(mechanism).tolist(),
         "largest_rotation": LARGEST_ROTATION,
         "farthest_node": FARTHEST_NODE,
         "rotation_per_step": ROTATION_PER_STEP,

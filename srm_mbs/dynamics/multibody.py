@@ -495,7 +495,7 @@ class Mechanics(Manifold):
         """Those among :meth:`constants` that depend on the start, or that the model may change."""
         return {
             "unit": self._unit,
-            "gap_scale": self.residual_scale,
+            "residual_scale": self.residual_scale,
             "damping": self._damping if self.is_damped else None,
             "friction": self._friction if self.has_friction else None,
             "friction_speed": float(self.friction_speed),
@@ -558,10 +558,6 @@ class OpenSystem(Mechanics):
     def constraint_residual(self, t: float, state: FloatArray) -> float:
         """0: there is no closure."""
         return 0.0
-
-    def residuals(self, state: FloatArray, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
-        """Two empty arrays: there is no closure."""
-        return np.zeros(0), np.zeros(0)
 
     def largest_residuals(self, state: FloatArray, t: float) -> tuple[float, float]:
         """Zeros: there is no closure."""

@@ -681,10 +681,10 @@ struct PySystem {
         model = std::move(to);
     }
 
-    void renew(nb::handle unit, nb::handle gap_scale, nb::handle damping, nb::handle friction,
+    void renew(nb::handle unit, nb::handle residual_scale, nb::handle damping, nb::handle friction,
                double friction_speed) {
-        system->renew(optional_vector(unit), optional_vector(gap_scale), optional_vector(damping),
-                      optional_vector(friction), friction_speed);
+        system->renew(optional_vector(unit), optional_vector(residual_scale),
+                      optional_vector(damping), optional_vector(friction), friction_speed);
     }
 };
 
@@ -755,7 +755,7 @@ void bind_system(nb::module_& m) {
         .def("hold", &PySystem::hold)
         .def("use_code", &PySystem::use_code, nb::arg("code").none())
         .def("move", &PySystem::move, nb::arg("model"), nb::arg("origins"))
-        .def("renew", &PySystem::renew, nb::arg("unit"), nb::arg("gap_scale"),
+        .def("renew", &PySystem::renew, nb::arg("unit"), nb::arg("residual_scale"),
              nb::arg("damping").none(), nb::arg("friction").none(), nb::arg("friction_speed"))
         .def("restart", [](PySystem& s) { s.system->restart(); })
         .def_prop_ro("sparse", [](const PySystem& s) { return s.system->sparse(); })
@@ -1100,7 +1100,7 @@ struct PyRun {
           const Array& state, const SmoothIntervals& intervals, const RunOptions& options,
           double t0, double first_step)
         : system(std::move(system_)), s(*nb::cast<PySystem&>(system).system) {
-        check_size("ErrorNorm.atol", norm.atol.size());
+        expect_size("ErrorNorm.atol", norm.atol.size(), 2 * static_cast<std::size_t>(s.nv));
         check(memory);
         std::vector<double> start = checked_state(state);
         auto control = make_control(scheme, stiff ? *stiff : scheme, constants, norm, memory,
@@ -1143,13 +1143,8 @@ struct PyRun {
         return outer;
     }
 
-    void check_size(const char* field, std::size_t found) const {
-        if (found != static_cast<std::size_t>(2 * s.nv))
-            throw nb::value_error((std::string(field) + " has not 2 nv numbers").c_str());
-    }
-
     void check(const IntegratorState& memory) const {
-        check_size("IntegratorState.rate", memory.rate.size());
+        expect_size("IntegratorState.rate", memory.rate.size(), 2 * static_cast<std::size_t>(s.nv));
         if (memory.history && !s.constrained())
             throw nb::value_error("IntegratorState.history is for mechanisms with closures");
     }
@@ -1194,8 +1189,7 @@ struct PyRun {
 
     void restore(const RunSnapshot& snapshot) {
         check(snapshot.memory);
-        if (snapshot.state.size() != run->state.size())
-            throw nb::value_error("RunSnapshot.state has not nq + nv numbers");
+        expect_size("RunSnapshot.state", snapshot.state.size(), run->state.size());
         run->restore(snapshot);
     }
 
@@ -1407,7 +1401,6 @@ void bind_run(nb::module_& m) {
         .def_prop_ro("state", [](const PyRun& r) { return owned_array(r.run->state); })
         .def_prop_ro("count", [](const PyRun& r) { return r.run->records.count(); })
         .def_prop_ro("at_breakpoint", [](const PyRun& r) { return r.run->at_breakpoint(); })
-        .def_prop_ro("interval_end", [](const PyRun& r) { return r.run->interval_end(); })
         .def_prop_ro("interval", [](const PyRun& r) { return r.run->interval(); })
         .def_prop_ro("evaluation_failed", [](const PyRun& r) { return r.run->evaluation_failed; })
         .def_prop_ro("placed", [](const PyRun& r) { return r.run->control->placed; })

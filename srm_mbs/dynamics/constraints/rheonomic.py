@@ -53,7 +53,7 @@ class _DriveRow(NamedTuple):
         Index of the row, and the inverse of its scale.
     in_q, in_v
         First place of the joint in q and v; -1 for a point.
-    wound
+    wraps
         Whether the coordinate is an angle that is stored as (cos, sin).
     """
 
@@ -61,7 +61,7 @@ class _DriveRow(NamedTuple):
     factor: float
     in_q: int
     in_v: int
-    wound: bool
+    wraps: bool
 
 
 class DrivenKinematics(LoopKinematics):
@@ -131,12 +131,12 @@ class DrivenKinematics(LoopKinematics):
 
     def move_to(self, t: float) -> None:
         """Subtract s, s' and s'' at t (s) from the rows of :meth:`update`."""
-        for (row, factor, _, _, wound), curve in zip(self._driven, self._curves):
+        for (row, factor, _, _, wraps), curve in zip(self._driven, self._curves):
             s, rate, acceleration = curve(t)
             self.g[row] -= factor * s
             self.target_rate[row] = factor * rate
             self.bias[row] -= factor * acceleration
-            if wound:  # of all turns the nearest
+            if wraps:  # of all turns the nearest
                 self.g[row] = factor * math.remainder(self.g[row] / factor, 2.0 * math.pi)
 
 

@@ -29,7 +29,7 @@ from srm_mbs.integration.generated.differentiation import (
     derivatives,
 )
 from srm_mbs.integration.generated.expressions import Expression, Output
-from srm_mbs.integration.generated.structure import COUPLING, ZERO, Bushing, Structure
+from srm_mbs.integration.generated.structure import ZERO, Bushing, Structure
 from srm_mbs.integration.generated.terms import Row, Trace
 from srm_mbs.integration.generated.vectors import (
     Vector,
@@ -190,7 +190,7 @@ def _damped(structure: Structure) -> bool:
     dampers += [
         force.numbers.start + 1
         for force in structure.forces
-        if force.kind == COUPLING and force.numbers.length
+        if force.kind == "coupling_spring" and force.numbers.length
     ]
     for bushing in structure.bushings:
         dampers += range(bushing.coefficients.start + 6, bushing.coefficients.start + 12)

@@ -109,7 +109,7 @@ class Subtraction(NamedTuple):
 
 
 class Force(NamedTuple):
-    """``ForceElement`` of forces.hpp.
+    """``ForceElement`` of forces.hpp, ``kind`` a name.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ class Force(NamedTuple):
         coordinate.
     """
 
-    kind: int
+    kind: str
     joint_a: int
     joint_b: int
     at_a: Span
@@ -142,7 +142,8 @@ class Force(NamedTuple):
 
 
 class Bushing(NamedTuple):
-    """A bushing, which the kernel evaluates and of which stiff steps take derivatives.
+    """A bushing, which the kernel evaluates, because its moments depend on the step, and of which
+    stiff steps take derivatives.
 
     Attributes
     ----------
@@ -369,9 +370,6 @@ def _signs(support: FloatArray) -> tuple[tuple[int, int], ...]:
     return tuple((int(j), int(support[j])) for j in np.flatnonzero(support))
 
 
-SPRING_DAMPER, BUSHING, COUPLING = 0, 4, 6
-"""Kinds among those of forces.hpp.  The kernel evaluates bushings, because their moments depend on
-the step."""
 _NO_ANCHOR = (0, np.array(_NO_PLACEMENT))
 
 
@@ -408,7 +406,7 @@ def structure_of(model: pin.Model, constants: Mapping[str, Any]) -> tuple[Struct
         "passive": any(constants[key] is not None for key in ("damping", "friction")),
     }
     fields |= _forces(numbers, constants["forces"])
-    bushings = [force for force in constants["forces"] if force["kind"] == BUSHING]
+    bushings = [force for force in constants["forces"] if force["kind"] == "bushing"]
     joints = [int(force[end][0]) for force in bushings for end in ("a", "b")]
     columns = {int(j) for force in bushings for j in np.flatnonzero(force["support"])}
     # In the order in which they are met, as generated.cpp's caller has them.
@@ -610,7 +608,7 @@ def _forces(numbers: _Numbers, forces: Sequence[Mapping[str, Any]]) -> dict[str,
         ends = int(a[0]), int(b[0]), numbers.rotated(a[1].tolist()), numbers.rotated(b[1].tolist())
         moves = tuple(columns.tolist()), numbers.take(support[columns].tolist(), units=True)
         own = np.asarray(force.get("numbers", ()))
-        if force["kind"] == BUSHING:
+        if force["kind"] == "bushing":
             acts = (own[:6] > 0.0) | (own[6:] > 0.0)
             law_of = np.where(acts, held + np.cumsum(acts) - 1, -1)
             bushings.append(
@@ -618,8 +616,8 @@ def _forces(numbers: _Numbers, forces: Sequence[Mapping[str, Any]]) -> dict[str,
             )
             held += int(acts.sum())
             continue
-        has_law = force["kind"] == COUPLING or (
-            force["kind"] == SPRING_DAMPER and (force["rest"] > 0.0 or own.size)
+        has_law = force["kind"] == "coupling_spring" or (
+            force["kind"] == "spring_damper" and (force["rest"] > 0.0 or own.size)
         )
         curves = len(force.get("curves", ()))
         out.append(
@@ -631,7 +629,7 @@ def _forces(numbers: _Numbers, forces: Sequence[Mapping[str, Any]]) -> dict[str,
                 numbers.take([force.get(key, 0.0) for key in ("stiffness", "damping", "rest")]),
                 force.get("in_q", 0),
                 force.get("in_v", 0),
-                bool(force.get("turns", False)),
+                bool(force.get("in_link_axes", False)),
                 numbers.take(own.tolist()),
                 Span(laws, curves),
                 held if has_law else -1,

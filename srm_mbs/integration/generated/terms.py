@@ -649,7 +649,7 @@ class Trace:
         lawful: Row = {}
         own: Row = {}
         for force in self.structure.forces:
-            kind = FORCE_KINDS[force.kind]
+            kind = force.kind
             to = tau if kind in LAWLESS else own if kind in ON_COORDINATES else lawful
             for j, value in self._generalised(force, columns):
                 to[j] = to.get(j, zero) + value
@@ -666,7 +666,7 @@ class Trace:
         """The generalised forces of an element, with their columns."""
         k, d, rest = self.take(force.coefficients)
         factors = self.take(force.factors)
-        kind = FORCE_KINDS[force.kind]
+        kind = force.kind
         if kind == "joint_torque":
             return list(enumerate(self._over_time(force), force.in_v))
         if kind == "torsion_spring":
@@ -795,13 +795,8 @@ class Trace:
         return subtract(acting, scaled(d, along))
 
 
-FORCE_KINDS = (
-    *("spring_damper", "joint_torque", "torsion_spring", "wrench", "bushing", "limit_spring"),
-    "coupling_spring",
-)
-"""As forces.hpp numbers them."""
 LAWLESS = ("joint_torque", "wrench")
-"""Those that neither damp nor store energy."""
+"""Kinds of forces that neither damp nor store energy."""
 ON_COORDINATES = ("torsion_spring", "limit_spring")
 """Those whose law is that of a coordinate."""
 

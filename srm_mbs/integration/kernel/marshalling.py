@@ -53,6 +53,16 @@ DECISIONS = (StepDecision.ACCEPTED, StepDecision.REJECTED, StepDecision.REPLACED
 """The decisions that the kernel numbers from 0: ``StepDecision`` in control.hpp."""
 _GROUPS = ("so3", "se3", "se2")
 """The groups that the kernel numbers from 0: ``Group`` in charts.hpp."""
+_FORCE_KINDS = (
+    "spring_damper",
+    "joint_torque",
+    "torsion_spring",
+    "wrench",
+    "bushing",
+    "limit_spring",
+    "coupling_spring",
+)
+"""The force elements that the kernel numbers from 0: ``ForceKind`` in forces.hpp."""
 
 
 def constants() -> Any:
@@ -463,51 +473,47 @@ def system_struct(constants: dict[str, Any]) -> Any:
             _core.GroupJoint(group=_GROUPS.index(group), start=start, size=size, position=position)
             for group, start, size, position in data.pop("groups")
         ],
-        residual_scale=data.pop("gap_scale"),
-        wrapped_angles=data.pop("turning"),
         damping=_NO_NUMBERS if damping is None else damping,
         friction=_NO_NUMBERS if friction is None else friction,
         **data,
     )
 
 
-def _driven_row(curve: dict[str, Any], wound: bool, **row: Any) -> Any:
-    return _core.DrivenRow(curve=_core.Curve(**curve), wraps=bool(wound), **row)
+def _driven_row(curve: dict[str, Any], **row: Any) -> Any:
+    return _core.DrivenRow(curve=_core.Curve(**curve), **row)
 
 
 _NO_ANCHOR = (0, np.zeros(12))
 
 
+_NO_FORCE: dict[str, Any] = {
+    "positions": [],
+    "stiffness": 0.0,
+    "damping": 0.0,
+    "rest": 0.0,
+    "in_q": 0,
+    "in_v": 0,
+    "in_link_axes": False,
+    "numbers": _NO_NUMBERS,
+}
+
+
 def force_struct(
-    kind: int,
+    kind: str,
     a: tuple[int, FloatArray] = _NO_ANCHOR,
     b: tuple[int, FloatArray] = _NO_ANCHOR,
     support: FloatArray = _NO_NUMBERS,
-    positions: Sequence[int] = (),
-    stiffness: float = 0.0,
-    damping: float = 0.0,
-    rest: float = 0.0,
-    in_q: int = 0,
-    in_v: int = 0,
-    turns: bool = False,
-    numbers: FloatArray = _NO_NUMBERS,
-    curves: tuple[dict[str, Any], ...] = (),
+    curves: Sequence[dict[str, Any]] = (),
+    **own: Any,
 ) -> Any:
     """``ForceElement`` of forces.hpp; the fields that its kind has not are zero or empty."""
     columns = np.flatnonzero(support)
     return _core.ForceElement(
-        kind=kind,
+        kind=_FORCE_KINDS.index(kind),
         a=_core.Anchor(joint=a[0], placement=a[1]),
         b=_core.Anchor(joint=b[0], placement=b[1]),
         columns=columns.tolist(),
         signs=support[columns].astype(float),
-        positions=list(positions),
-        stiffness=stiffness,
-        damping=damping,
-        rest=rest,
-        in_q=in_q,
-        in_v=in_v,
-        in_link_axes=turns,
-        numbers=numbers,
         curves=[_core.Curve(**curve) for curve in curves],
+        **_NO_FORCE | own,
     )

@@ -43,7 +43,7 @@ def _make_all_rows(system: ClosedSystem | OpenSystem) -> Any:
         "structural_rank": 0,
         "sigma_ref": 1.0,
         "order": [],
-        "gap_scale": np.ones(len(rows.g)),
+        "residual_scale": np.ones(len(rows.g)),
         "drives": rows.drive_constants(),
     }
     constants = system.constants() | rows.constants() | own

@@ -195,7 +195,7 @@ def test_a_workspace_is_not_renewed_with_arrays_of_other_sizes() -> None:
     system = ClosedSystem(load("four_bar"))
     kernel_system = core.System(system.model, marshalling.system_struct(system.constants()), None)
     good = system.constants_of_start() | {"damping": None, "friction": None}
-    for name, size in (("unit", 2), ("gap_scale", 3), ("damping", 1), ("friction", 4)):
+    for name, size in (("unit", 2), ("residual_scale", 3), ("damping", 1), ("friction", 4)):
         with pytest.raises(ValueError, match=r"has \d numbers instead of \d"):
             kernel_system.renew(**good | {name: np.ones(size)})
     kernel_system.renew(**good)

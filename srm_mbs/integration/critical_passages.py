@@ -490,7 +490,7 @@ class PassageAlongCurve:
 
     def _panel(self, a: float, b: float) -> float:
         """Go on along the panel from ``a`` to ``b``, of xi times the heading, or only to a place
-        behind the end of the passage; where it led."""
+        beyond the end of the passage; where it led."""
         x, w, integrals = gauss_nodes(self._count)
         weights, own = np.vstack([integrals, w]), np.concatenate([[0.0], x, [1.0]])
         # Of the evaluation made last.
@@ -797,30 +797,18 @@ class CriticalPassages:
             return []  # forces have changed, and it turns back
 
     def _along(self, passage: PassageAlongCurve) -> list[tuple[StepResult, float]]:
-        steps = self._steps(passage)
+        """The ``passage`` as steps from node to node."""
+        steps = [(self._step(passage, i), t) for i, t in enumerate(passage.times[1:].tolist())]
         self._rest = passage.rest
         if steps:
             self._known, self._quiet, self._examine_below = False, False, np.inf
             self._sigma = float(steps[-1][0].sigmas[-1])
         return steps
 
-    def _steps(self, passage: PassageAlongCurve) -> list[tuple[StepResult, float]]:
-        """The ``passage`` as steps from node to node."""
-        times, states, rates = passage.times, passage.states, passage.rates
-        return [
-            (self._step(times, states, rates, passage.sigmas, i), float(times[i + 1]))
-            for i in range(len(times) - 1)
-        ]
-
-    def _step(
-        self,
-        times: FloatArray,
-        states: FloatArray,
-        rates: FloatArray,
-        sigmas: FloatArray,
-        i: int,
-    ) -> StepResult:
+    def _step(self, passage: PassageAlongCurve, i: int) -> StepResult:
+        """The step from node ``i`` to the next."""
         system, scheme = self._system, self._scheme
+        times, states, rates, sigmas = passage.times, passage.states, passage.rates, passage.sigmas
         h = float(times[i + 1] - times[i])
         delta = system.difference(states[i], states[i + 1], h * rates[i])
         stages = np.tile(rates[i], (scheme.n_stages + 1, 1))

@@ -107,11 +107,6 @@ def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> BoolArray:
     return out
 
 
-def _whole(scheme: ButcherTableau, steps: StepData) -> FloatArray:
-    """Weights (k,) of the rates of ``scheme`` over a whole step, of those that ``steps`` have."""
-    return scheme.dense.rows[0, : steps.rates.shape[1]]
-
-
 class HermiteStep:
     """The interpolant of one step.
 
@@ -138,29 +133,27 @@ class HermiteStep:
         self._start = steps.states[step]
         self._h = steps.times[step + 1] - steps.times[step]
         best = np.inf
-        layer = steps.layers[step]
         ends = [self._nodes(count) for count in HERMITE_NODES]
         away = [self._away(count) for count in HERMITE_NODES]
-        variants = [(None, ends)]
+        variants: list[tuple[FloatArray | None, list[list[int]]]] = [(None, ends)]
         if away != ends:
             variants.append((None, away))
-        if layer[1] > 0.0:
-            variants.append((layer, ends))
-        for self._layer, nodes in variants:
-            polynomials = [self._through(own) for own in nodes]
-            values = [polynomial(self._variable(COMPARED_AT)[0]) for polynomial in polynomials]
+        if steps.layers[step, 1] > 0.0:
+            variants.append((steps.layers[step], ends))
+        for layer, nodes in variants:
+            polynomials = [self._through(own, layer) for own in nodes]
+            values = [poly(self._variable(COMPARED_AT, layer)[0]) for poly in polynomials]
             changes = [float(np.abs(b - a).max()) for a, b in pairwise(values)]
             if min(changes) < best:
-                best, chosen = min(changes), self._layer
+                best, self._layer = min(changes), layer
                 self._polynomial = polynomials[1 if changes[1] <= changes[0] else 0]
-        self._layer = chosen
 
-    def _variable(self, theta: Any) -> tuple[Any, Any]:
-        """The variable of the polynomial at the fractions ``theta`` of the step, and its derivative
-        by the time in steps."""
-        if self._layer is None:
+    def _variable(self, theta: Any, layer: FloatArray | None) -> tuple[Any, Any]:
+        """The variable of a polynomial at the fractions ``theta`` of the step, in a ``layer`` (2,)
+        if there is one, and its derivative by the time in steps."""
+        if layer is None:
             return theta, np.ones_like(theta)
-        centre, width = self._layer
+        centre, width = layer
         beside = (self._steps.times[self._step] - centre + theta * self._h) / width
         return np.arcsinh(beside), self._h / width / np.hypot(1.0, beside)
 
@@ -209,12 +202,15 @@ class HermiteStep:
         for kind in (False, True):
             chosen = stiff == kind
             if chosen.any():
-                weights = _whole(self._scheme.member(kind), steps)
+                # Over a whole step, of the rates that there are.
+                weights = self._scheme.member(kind).dense.rows[0, : steps.rates.shape[1]]
                 rates = steps.rates[own][chosen, : len(weights)]
                 moved += weights @ np.tensordot(h[chosen], rates, axes=1)
         return moved if node > self._step else -moved
 
-    def _through(self, nodes: list[int]) -> Callable[[FloatArray], FloatArray]:
+    def _through(
+        self, nodes: list[int], layer: FloatArray | None
+    ) -> Callable[[FloatArray], FloatArray]:
         from scipy.interpolate import KroghInterpolator
 
         steps = self._steps
@@ -226,14 +222,14 @@ class HermiteStep:
             moved = self._moved(i) if self._system.wraps else None
             delta = self._system.difference(self._start, steps.states[i], moved)
             rate = steps.rate_at(i, last)
-            at, growth = self._variable((steps.times[i] - t0) / self._h)
+            at, growth = self._variable((steps.times[i] - t0) / self._h, layer)
             points += 2 * [float(at)]
             values += [delta, self._h / growth * self._system.chart_rate(delta, rate)]
         return KroghInterpolator(np.array(points), np.array(values))  # type: ignore[no-any-return]
 
     def __call__(self, theta: FloatArray) -> FloatArray:
         """States (k, nx) at the fractions ``theta`` (k,) of the step."""
-        deltas = self._polynomial(self._variable(theta)[0])
+        deltas = self._polynomial(self._variable(theta, self._layer)[0])
         return np.array([self._system.retract(self._start, delta) for delta in deltas])
 
 

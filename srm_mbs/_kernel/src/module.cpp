@@ -96,6 +96,15 @@ private:
     std::vector<double> squares_;
 };
 
+// LargestNorms of the rows of x (n, width).
+std::vector<double> largest_norms(const Array& x, const std::vector<int>& order,
+                                  const std::vector<int>& starts) {
+    if (x.ndim() != 2) throw nb::value_error("x has another shape");
+    LargestNorms norms(order, starts, x.shape(1));
+    for (std::size_t i = 0; i < x.shape(0); ++i) norms.take(x.data() + i * x.shape(1));
+    return norms.norms();
+}
+
 // A view of `values`, which `owner` keeps alive.
 template <typename Values>
 nb::object view(const Values& values, std::initializer_list<std::size_t> shape, nb::handle owner) {
@@ -331,7 +340,8 @@ struct PySystem {
         return nb::make_tuple(owned_array(std::move(g)), owned_array(std::move(G), {rows, width}));
     }
 
-    // This call and the next ones need a system that no other thread uses meanwhile.
+    // This call and those up to open_norms() need a system that no other thread uses meanwhile.
+
     // close_loops() from q (nq,): the last configuration, and the largest error there.
     nb::tuple close(Algebra& algebra, const Array& row_unit, const Array& units, const Array& q,
                     const ClosingLimits& limits) {
@@ -917,15 +927,15 @@ private:
 
 // Arrays (size,) for functions of the user, which may keep them and write to them: the next row of a
 // block, because an array of its own costs ten times as much.  With the interpreter's lock held.
-class Rows {
+class ArgumentRows {
 public:
     // Those of all callers; never deleted, because the interpreter may end first.
-    static Rows& of(int size) {
-        static auto& all = *new std::map<int, Rows>;
+    static ArgumentRows& of(int size) {
+        static auto& all = *new std::map<int, ArgumentRows>;
         return all.try_emplace(size, size).first->second;
     }
 
-    explicit Rows(int size) : size_(static_cast<std::size_t>(size)), taken_(many) {}
+    explicit ArgumentRows(int size) : size_(static_cast<std::size_t>(size)), taken_(many) {}
 
     nb::object next(const double* numbers) {
         if (taken_ == many) {
@@ -952,8 +962,8 @@ private:
 class CalledEvent {
 public:
     CalledEvent(nb::handle event, int nq, int nv)
-        : event_(event), function_(event.attr("function").attr("function")), q_(Rows::of(nq)),
-          v_(Rows::of(nv)), nq_(nq) {}
+        : event_(event), function_(event.attr("function").attr("function")),
+          q_(ArgumentRows::of(nq)), v_(ArgumentRows::of(nv)), nq_(nq) {}
 
     // The value at t and a state (nx,); raises what EventFunction raises.
     double value(double t, const double* state) {
@@ -977,7 +987,7 @@ public:
 
 private:
     nb::handle event_, function_;
-    Rows &q_, &v_;
+    ArgumentRows &q_, &v_;
     int nq_;
 };
 
@@ -1405,15 +1415,6 @@ void bind_run(nb::module_& m) {
         .def_prop_ro("evaluation_failed", [](const PyRun& r) { return r.run->evaluation_failed; })
         .def_prop_ro("placed", [](const PyRun& r) { return r.run->control->placed; })
         .def_prop_ro("replaced", [](const PyRun& r) { return r.run->control->replaced; });
-}
-
-// LargestNorms of the rows of x (n, width).
-std::vector<double> largest_norms(const Array& x, const std::vector<int>& order,
-                                  const std::vector<int>& starts) {
-    if (x.ndim() != 2) throw nb::value_error("x has another shape");
-    LargestNorms norms(order, starts, x.shape(1));
-    for (std::size_t i = 0; i < x.shape(0); ++i) norms.take(x.data() + i * x.shape(1));
-    return norms.norms();
 }
 
 // ---- Dense output -------------------------------------------------------------------------------

@@ -383,7 +383,7 @@ def integrate(
     try:
         if events is not None:
             events.begin(t, x)
-        while t < t_end:
+        while t < t_end and record.stop is None:
             if breakpoints is not None and t >= breakpoints.end:
                 if record.times:
                     record.breaks.append(len(record.times))
@@ -393,8 +393,6 @@ def integrate(
             if passages is not None and passages.under_way:
                 if not pass_critical(None):
                     memory = restarted()
-                elif record.stop is not None:
-                    break
                 continue
             limit = min(max_step, system.step_limit(x), jump.limit)
             proposal = control.propose(t, limit, memory)
@@ -404,8 +402,6 @@ def integrate(
             h = proposal.h
             expected = control.next_zero()
             if pass_critical(None if passages is None else passages.unexamined(expected, t)):
-                if record.stop is not None:
-                    break
                 continue
             failure = _no_further_step(record, t, h, t_end, unevaluated, words)
             if failure is not None:
@@ -421,8 +417,6 @@ def integrate(
             if result is not None and pass_critical(
                 None if passages is None else passages.crossing(result)
             ):
-                if record.stop is not None:
-                    break
                 continue
             if result is not None and jump.misses(proposal, memory, result, control.adaptive):
                 continue
@@ -455,7 +449,7 @@ def integrate(
                 record.rest = t, x
                 for taken in (record.steps, record.times, record.breaks):
                     taken.clear()
-        else:
+        if record.status is RunStatus.RUNNING:
             record.mark_finished(t_end)
     except (KeyboardInterrupt, ControllerError, EvaluationError, EventError) as error:
         record.mark_aborted(t, error)

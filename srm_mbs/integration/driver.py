@@ -351,7 +351,7 @@ def integrate(
         stop = None
         if events is not None:
             dense = step_dense(system, method.scheme, start, result, t)
-            stop = events.after_step(result.t, start, t, x, dense)
+            stop = events.after_step(result.t, t, x, dense)
         if stop is not None:
             record.mark_stopped(stop)
             return True

@@ -212,12 +212,9 @@ def prepare_events(
     InputError
         If something cannot be called, or an attribute has no meaning.
     """
-    given: Sequence[Any] = [events]
-    if not callable(events):
-        given = listed_events(events)
     return [
         event if isinstance(event, EventFunction) else _event_function(event, i, adapt)
-        for i, event in enumerate(given)
+        for i, event in enumerate(listed_events(events))
     ]
 
 
@@ -356,10 +353,8 @@ class EventWatch:
             for event, value in zip(self._events, self._values)
         ]
 
-    def after_step(
-        self, t: float, state: FloatArray, t_new: float, end: FloatArray, dense: StepDense
-    ) -> Stop | None:
-        """Record the events of an accepted step from ``state`` at ``t`` to ``end`` at ``t_new``.
+    def after_step(self, t: float, t_new: float, end: FloatArray, dense: StepDense) -> Stop | None:
+        """Record the events of an accepted step from ``t`` to the state ``end`` at ``t_new`` (s).
 
         Returns
         -------

@@ -20,7 +20,7 @@ from srm_mbs.integration.driver import EndOfSteps, RunRecord, StepSink, Tick
 from srm_mbs.integration.events import EventWatch
 from srm_mbs.integration.kernel.events import CompiledEventWatch
 from srm_mbs.integration.kernel.marshalling import DECISIONS, steps_from
-from srm_mbs.integration.kernel.run import CompiledRun, ReturnReason
+from srm_mbs.integration.kernel.run import CompiledRun, CompiledStepDense, ReturnReason
 from srm_mbs.integration.messages import RunFailure, StopReason
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
@@ -189,7 +189,8 @@ def integrate(
             if events is not None:
                 if passing is not None:
                     passing.follow(core.interval)
-                stop = events.after_step(t_start, start, t, state, run.step_dense(system, start))
+                dense = CompiledStepDense(run, system, start)
+                stop = events.after_step(t_start, t, state, dense)
                 if stop is not None:
                     record.mark_stopped(stop)
                     break

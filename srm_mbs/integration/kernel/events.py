@@ -58,7 +58,7 @@ class CompiledEventWatch:
         self._search.begin(t, state)
 
     def after_step(
-        self, t: float, state: FloatArray, t_new: float, end: FloatArray, dense: CompiledStepDense
+        self, t: float, t_new: float, end: FloatArray, dense: CompiledStepDense
     ) -> Stop | None:
         """As the reference."""
         found = self._search.after_step(t, t_new, end, dense.compiled, dense.by_reference)

@@ -245,10 +245,6 @@ class CompiledRun:
             placement="critical" if r.critical else "",
         )
 
-    def step_dense(self, system: System, start: FloatArray) -> CompiledStepDense:
-        """Dense output of the step made last, from the state ``start``."""
-        return CompiledStepDense(self, system, start)
-
     def memory(self) -> IntegratorState:
         """The state of the integrator before the next step."""
         return marshalling.state_from(self.core.memory())

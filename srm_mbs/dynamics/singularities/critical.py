@@ -91,12 +91,6 @@ class CriticalConfiguration:
         out: FloatArray = (self.u @ self.rows) / self.geometry.row_size
         return out
 
-    @cached_property
-    def combination(self) -> FloatArray:
-        """``weights``, of unit length."""
-        out: FloatArray = self.weights / np.linalg.norm(self.weights)
-        return out
-
     @property
     def residual(self) -> float:
         """delta, in row units: relative to the size of the mechanism."""

@@ -376,11 +376,6 @@ class Abscissa:
         self._joint, self._factor, self._unit = joint, factors[unit], unit
         self.label = f"{plain(joint)} ({unit})"
 
-    @property
-    def is_time(self) -> bool:
-        """Whether it is the time."""
-        return self._joint is None
-
     def of(self, run: Run) -> FloatArray:
         """Values (n,) at the times of ``run``."""
         if self._joint is None or not isinstance(run, SimulationResult):

@@ -666,12 +666,8 @@ class LinkageVariants:
         self._linkage, self._change, self._places = linkage, change, places
         own, entry, reaches = linkage.options.own, linkage.entry, change.reaches
         self._numbers = nested(places)[PLANAR]
-        self._least = [
-            (k, math.ulp(0.0) if place[-1] == "length" else 0.0)
-            for k, place in enumerate(places)
-            if place[-1] in NUMBERS_OF_BARS
-        ]
-        """Numbers that have a least value, by their place in the order of ``places``, and this."""
+        self._sizes = [k for k, place in enumerate(places) if place[-1] in NUMBERS_OF_BARS]
+        """Places, in the order of ``places``, of the numbers that cannot be negative."""
         self._lines = {
             slider.name: linkage.line(slider)
             for slider in entry.slider
@@ -734,7 +730,7 @@ class LinkageVariants:
     def __call__(self, numbers: Sequence[float]) -> Numbers | None:
         """The numbers of the variant with these at the places; None where it has to be read as a
         whole, because of a fault perhaps."""
-        if any(numbers[k] < least for k, least in self._least):
+        if any(numbers[k] < 0.0 for k in self._sizes):
             return None
         entry = with_numbers(self._linkage.entry, self._numbers, numbers)
         varied = self._linkage.varied(entry, self._change)

@@ -666,7 +666,7 @@ class LinkageVariants:
         self._linkage, self._change, self._places = linkage, change, places
         own, entry, reaches = linkage.options.own, linkage.entry, change.reaches
         self._numbers = nested(places)[PLANAR]
-        self._sizes = [k for k, place in enumerate(places) if place[-1] in NUMBERS_OF_BARS]
+        self._not_negative = [k for k, place in enumerate(places) if place[-1] in NUMBERS_OF_BARS]
         """Places, in the order of ``places``, of the numbers that cannot be negative."""
         self._lines = {
             slider.name: linkage.line(slider)
@@ -730,7 +730,7 @@ class LinkageVariants:
     def __call__(self, numbers: Sequence[float]) -> Numbers | None:
         """The numbers of the variant with these at the places; None where it has to be read as a
         whole, because of a fault perhaps."""
-        if any(numbers[k] < 0.0 for k in self._sizes):
+        if any(numbers[k] < 0.0 for k in self._not_negative):
             return None
         entry = with_numbers(self._linkage.entry, self._numbers, numbers)
         varied = self._linkage.varied(entry, self._change)

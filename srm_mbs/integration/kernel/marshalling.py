@@ -53,7 +53,7 @@ DECISIONS = (StepDecision.ACCEPTED, StepDecision.REJECTED, StepDecision.REPLACED
 """The decisions that the kernel numbers from 0: ``StepDecision`` in control.hpp."""
 _GROUPS = ("so3", "se3", "se2")
 """The groups that the kernel numbers from 0: ``Group`` in charts.hpp."""
-_FORCE_KINDS = (
+FORCE_KINDS = (
     "spring_damper",
     "joint_torque",
     "torsion_spring",
@@ -509,7 +509,7 @@ def force_struct(
     """``ForceElement`` of forces.hpp; the fields that its kind has not are zero or empty."""
     columns = np.flatnonzero(support)
     return _core.ForceElement(
-        kind=_FORCE_KINDS.index(kind),
+        kind=FORCE_KINDS.index(kind),
         a=_core.Anchor(joint=a[0], placement=a[1]),
         b=_core.Anchor(joint=b[0], placement=b[1]),
         columns=columns.tolist(),

@@ -164,13 +164,15 @@ def checked_name(name: Any, what: str) -> str:
     return plain(name)
 
 
-def finite_number(value: Any, name: str, element: str) -> float:
+def finite_number(
+    value: Any, name: str, element: str, remedy: str = "Give a finite number"
+) -> float:
     """``value``, called ``name`` in messages, as a finite float.
 
     Raises
     ------
     InputError
-        About ``element``, if it is anything else.
+        About ``element``, with the ``remedy``, if it is anything else.
     """
     if _is_finite_float(value):
         return float(value)
@@ -179,7 +181,7 @@ def finite_number(value: Any, name: str, element: str) -> float:
         raise InputError(
             f"{name} = {safe_repr(value)} is not a finite number",
             element=element,
-            remedy="Give a finite number",
+            remedy=remedy,
         )
     return float(array)
 

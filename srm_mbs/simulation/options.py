@@ -22,7 +22,7 @@ from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.integration.methods.tableaus import get_tableau
 from srm_mbs.integration.methods.thesis.srm import SRM
-from srm_mbs.model.numbers import choice, finite_array, flag
+from srm_mbs.model.numbers import choice, finite_array, finite_number, flag
 
 LOOSEST_RTOL = 1e-4
 """Looser tolerances let sweeps jump to another branch at a change point."""
@@ -225,16 +225,7 @@ def check_progress(progress: Any, arguments: str) -> None:
 
 def finite(value: Any, what: str) -> float:
     """``value`` as a finite number of seconds."""
-    if type(value) is float and math.isfinite(value):
-        return value
-    number = finite_array(value, ())
-    if number is None:
-        raise InputError(
-            f"{what} = {safe_repr(value)} is not a finite number",
-            element=what,
-            remedy="Give a number of seconds",
-        )
-    return float(number)
+    return finite_number(value, what, what, "Give a number of seconds")
 
 
 def numbers(values: Any, what: str, remedy: str) -> FloatArray:

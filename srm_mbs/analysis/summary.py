@@ -19,7 +19,7 @@ from srm_mbs.dynamics.scaling import angle_coordinates, is_angle, row_angles, sc
 from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
 from srm_mbs.integration.kernel.backend import backend, code_status
 from srm_mbs.model.anchors import Anchor
-from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.closures import JointRow, LoopClosure
 from srm_mbs.model.coordinates import position_of
 from srm_mbs.simulation.result import SimulationResult
 
@@ -221,13 +221,24 @@ def loop_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str, str]]:
 def _relation(loop: LoopClosure) -> str:
     """The equation of a coupling: "first = 2 second + 0.1"."""
     (row,) = loop.rows.joint_rows
+    if not isinstance(loop.type, str):  # of the user, who knows what its keys mean
+        return _row_relation(row)
     if loop.polynomial is not None:
         return _polynomial_relation(loop, loop.polynomial)
     if loop.ratio is not None:
         terms = f"{row.joints[0]} = {loop.ratio:g} {row.joints[1]}"
         return f"{terms} {row.offset:+g}" if row.offset else terms
-    terms = " ".join(f"{c:+g} {name}" for c, name in zip(row.coefficients, row.joints))
-    return f"{terms} = {row.offset:g}"
+    return _row_relation(row)
+
+
+def _row_relation(row: JointRow) -> str:
+    """The equation of a joint row: "+1 first -2 second = 0.1 +3 y^2, y = +1 second"."""
+    left, right = (
+        " ".join(f"{c:+g} {name}" for c, name in zip(numbers, row.joints) if c)
+        for numbers in (row.coefficients, row.arguments)
+    )
+    powers = "".join(f" {a:+g} y^{k}" for k, a in enumerate(row.powers, 2) if a)
+    return f"{left} = {row.offset:g}{powers}" + (f", y = {right}" if powers else "")
 
 
 def _polynomial_relation(loop: LoopClosure, polynomial: Sequence[float]) -> str:

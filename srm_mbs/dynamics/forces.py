@@ -813,7 +813,9 @@ class ForceKinematics:
         self._elements: list[Evaluator] = [
             CouplingSpringEvaluator(model, force, friction_speed)
             if isinstance(force, CouplingSpring)
-            else _EVALUATORS[type(force)](model, force)
+            else next(made for kind, made in _EVALUATORS.items() if isinstance(force, kind))(
+                model, force
+            )
             for force in forces
         ]
 

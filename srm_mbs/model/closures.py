@@ -35,7 +35,14 @@ from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
 from srm_mbs.model.copies import copied
 from srm_mbs.model.lazy import cached_property
-from srm_mbs.model.numbers import checked_name, finite_number, finite_numbers, plain, unit_vector
+from srm_mbs.model.numbers import (
+    checked_name,
+    finite_array,
+    finite_number,
+    finite_numbers,
+    plain,
+    unit_vector,
+)
 
 
 def perpendicular_basis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -287,6 +294,13 @@ CLOSURE_TYPES: Mapping[str, ClosureType] = MappingProxyType({kind.name: kind for
 """The closures by their type in a description."""
 
 
+_ALWAYS = ("type", "name", "without")
+"""Keys of every closure."""
+UNIT_LENGTH_TOLERANCE = 1e-9
+"""Deviation of the length of a unit vector from 1 that is rounding."""
+_ROW_SHAPES = {"directions": (3,), "alignments": (2, 3), "matched": (3,)}
+"""Shapes of the vectors of one row of a :class:`RowSet`."""
+
 COINCIDENCE_TOLERANCE = 1e-9
 """Distance of two points, over their distance from the world's origin, that is rounding."""
 
@@ -383,12 +397,20 @@ class LoopClosure:
                 f"Known: {', '.join(CLOSURE_TYPES)}",
             )
         kind = self.kind
+        keys = [entry.name for entry in fields(self) if entry.name not in _ALWAYS]
+        for key in (*kind.needs, *kind.takes):
+            if key not in keys:
+                raise self._fault(
+                    f"the closure type {safe_repr(kind.name)} needs or takes {safe_repr(key)}, "
+                    "which is no key of a closure",
+                    f"Known: {', '.join(keys)}",
+                )
         for entry in fields(self):
             key, missing = entry.name, getattr(self, entry.name) is None
             if missing and key in kind.needs:
                 problem = f"a {kind.name} closure needs {entry.metadata['words']}"
                 raise self._fault(problem, entry.metadata["remedy"])
-            if not missing and key not in ("type", "name", "without", *kind.needs, *kind.takes):
+            if not missing and key not in (*_ALWAYS, *kind.needs, *kind.takes):
                 raise self._fault(f"a {kind.name} closure takes no {key}", f'Remove "{key}"')
         for key in ("axis", "axis_a", "axis_b"):
             given = getattr(self, key)
@@ -399,6 +421,8 @@ class LoopClosure:
         if self.joints is not None:
             self._take_joints(self.joints)
         self._take_without()
+        if isinstance(self.type, ClosureType):
+            _ = self.rows  # which checks them
 
     def between(self, a: Anchor, b: Anchor) -> LoopClosure:
         """The same closure between other places."""
@@ -573,7 +597,81 @@ class LoopClosure:
             given["length"] = self.length
         if self.joints is not None:
             given["joint_row"] = self._joint_row(self.joints)
-        return self.kind.rows(ClosureValues(**given))
+        rows = self.kind.rows(ClosureValues(**given))
+        return self._checked_rows(rows) if isinstance(self.type, ClosureType) else rows
+
+    def _checked_rows(self, rows: Any) -> RowSet:
+        """The ``rows`` that a type of the user returned, their numbers as arrays.
+
+        Raises
+        ------
+        InputError
+            If they are not those of a :class:`RowSet`, or cannot be evaluated.
+        """
+        if not isinstance(rows, RowSet):
+            raise self._fault(
+                f"the rows of the type {safe_repr(self.type_name)} are {safe_repr(rows)}",
+                "Return a RowSet",
+            )
+        arrays: dict[str, FloatArray] = {}
+        for key, shape in _ROW_SHAPES.items():
+            given = getattr(rows, key)
+            array = finite_array(given, (None, *shape))
+            if array is None or not np.allclose(
+                np.linalg.norm(array, axis=-1), 1.0, rtol=0.0, atol=UNIT_LENGTH_TOLERANCE
+            ):
+                raise self._fault(
+                    f"the {key} {safe_repr(given)} are not unit vectors",
+                    f"Give an array of shape (n, {', '.join(map(str, shape))})",
+                )
+            arrays[key] = array
+        distances = finite_array(rows.distances, (None,))
+        if distances is None or (distances <= 0.0).any():
+            raise self._fault(
+                f"the distances {safe_repr(rows.distances)} are not positive numbers",
+                "Give a list of lengths (m)",
+            )
+        joint_rows = _listed(rows.joint_rows)
+        for row in joint_rows:
+            self._check_joint_row(row)
+        anchored = len(arrays["directions"]) + len(distances) + len(arrays["alignments"])
+        if len(joint_rows) > (0 if anchored else 1):
+            raise self._fault(
+                "a joint row is joined with other rows", "Give each joint row its own closure"
+            )
+        if anchored and not self.anchors:
+            raise self._fault(
+                "rows between anchors need a and b", "Put both among the needs of the type"
+            )
+        labels, count = _listed(rows.labels), anchored + len(joint_rows)
+        if not count or isinstance(rows.labels, str) or len(set(labels)) != count:
+            raise self._fault(
+                f"{count} rows have the labels {safe_repr(rows.labels)}",
+                "Give at least one row, and each a label of its own",
+            )
+        return replace(
+            rows,
+            labels=labels,
+            distances=tuple(distances.tolist()),
+            joint_rows=joint_rows,
+            **arrays,
+        )
+
+    def _check_joint_row(self, row: Any) -> None:
+        """Refuse a joint row of a type of the user that cannot be evaluated."""
+        if not isinstance(row, JointRow) or row.joints != self.joints:
+            raise self._fault(
+                f"the joint row {safe_repr(row)} is not over the joints of the closure",
+                "Put joints among the needs of the type, and take values.joint_row.joints",
+            )
+        for key, count in (
+            ("coefficients", len(row.joints)),
+            ("arguments", len(row.joints) if row.powers else 0),
+            ("powers", len(_listed(row.powers))),
+        ):
+            remedy = "Give one number for each joint"
+            finite_numbers(getattr(row, key), count, key, remedy, self._element)
+        finite_number(row.offset, "offset", self._element)
 
     def _joint_row(self, joints: tuple[str, ...]) -> JointRow:
         """The row of a coupling, the linear part of a polynomial among its coefficients."""

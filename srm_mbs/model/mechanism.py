@@ -26,7 +26,7 @@ from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.copies import copied
 from srm_mbs.model.drives import Drive, positions
-from srm_mbs.model.forces import ForceElement
+from srm_mbs.model.forces import FORCE_TYPES, ForceElement, UserForce
 from srm_mbs.model.laws import Curve, Law
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import checked_name, vector_elements
@@ -293,10 +293,14 @@ class MechanismData(ResultOwner):
             pin.neutral(model) if self.q0 is None else self.q0,
             np.zeros(model.nv) if self.v0 is None else self.v0,
         )
-        loops = checked_elements(model, "loop", self.loops, "LoopClosure")
+        examples = "[srm.LoopClosure(...)]"
+        loops = checked_elements(model, "loop", self.loops, (LoopClosure,), examples)
         set_(self, "loops", tuple(loop.measured(model, self.q0) for loop in loops))
-        set_(self, "forces", checked_elements(model, "force", self.forces, "SpringDamper"))
-        set_(self, "drives", checked_elements(model, "drive", self.drives, "Drive"))
+        examples = "[srm.SpringDamper(...)], or [srm.UserForce(...)] for a force of your own"
+        types: tuple[Any, ...] = (*FORCE_TYPES.values(), UserForce)
+        set_(self, "forces", checked_elements(model, "force", self.forces, types, examples))
+        examples = "[srm.Drive(...)]"
+        set_(self, "drives", checked_elements(model, "drive", self.drives, (Drive,), examples))
         set_(self, "friction_speed", checked_friction_speed(model, self.friction_speed))
         set_(self, "points", checked_points(model, self.points))
         set_(self, "actuators", checked_actuators(model, self.actuators))

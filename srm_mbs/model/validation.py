@@ -207,26 +207,27 @@ Part = TypeVar("Part", bound=_Part)
 
 
 def checked_elements(
-    model: pin.Model, what: str, given: Iterable[Part], example: str
+    model: pin.Model, what: str, given: Iterable[Part], types: tuple[type, ...], examples: str
 ) -> tuple[Part, ...]:
-    """The parts of the kind ``what`` (loop, force, drive) of a mechanism as a tuple.
+    """The parts of the kind ``what`` (loop, force, drive) of a mechanism, of the ``types`` that the
+    equations know, as a tuple; messages show ``examples``.
 
     Raises
     ------
     InputError
-        If they are not several, one has no name and cannot check itself, names repeat, or one does
-        not fit ``model``.
+        If they are not several, one is of another type, names repeat, or one does not fit
+        ``model``.
     """
     several = isinstance(given, Iterable) and not isinstance(given, str)
     try:
         parts: tuple[Any, ...] = tuple(given) if several else (given,)
     except Exception:  # objects may raise anything
         several, parts = False, (given,)
-    if not several or not all(hasattr(part, "name") and hasattr(part, "check") for part in parts):
+    if not several or not all(isinstance(part, types) for part in parts):
         raise InputError(
             f"{what}s = {safe_repr(given)} is not a list of {what}s",
             element=f"{what}s",
-            remedy=f"Give a list of them, such as [srm.{example}(...)]",
+            remedy=f"Give a list of them, such as {examples}",
         )
     names = [part.name for part in parts]
     for name in names:

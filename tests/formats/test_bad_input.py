@@ -701,6 +701,15 @@ def test_a_name_in_the_place_of_an_anchor_is_refused(made: Any) -> None:
         made()
 
 
+class OwnForce(srm.ForceElement):
+    """A force element whose force the equations do not know."""
+
+    type, name = "own", "own"
+
+    def check(self, model: pin.Model) -> None:
+        pass
+
+
 @pytest.mark.parametrize(
     ("what", "given"),
     [
@@ -710,12 +719,34 @@ def test_a_name_in_the_place_of_an_anchor_is_refused(made: Any) -> None:
         ("drives", srm.Drive(srm.ConstantSpeed(1.0), "crank")),
         ("drives", "crank"),
         ("loops", srm.LoopClosure("point", srm.Anchor("coupler"), srm.Anchor("world"))),
+        ("loops", [srm.TorsionSpring("crank", 1.0)]),
+        ("drives", [srm.TorsionSpring("crank", 1.0)]),
+        ("forces", [srm.Drive(srm.ConstantSpeed(1.0), "crank")]),
+        ("forces", [OwnForce()]),
     ],
 )
 def test_elements_that_are_no_list_of_them_are_refused(what: str, given: Any) -> None:
     mechanism = srm.load("four_bar")
     with pytest.raises(srm.InputError, match=f"{what} = .* is not a list of {what}"):
         replace(mechanism, **{what: given})
+
+
+def test_a_force_element_of_ones_own_is_answered_with_the_user_force() -> None:
+    with pytest.raises(srm.InputError, match=r"srm\.UserForce\(\.\.\.\)"):
+        replace(srm.load("four_bar"), forces=[OwnForce()])
+
+
+class NamedSpring(srm.TorsionSpring):
+    """A spring with a class of its own, as for the parts of a catalogue."""
+
+
+def test_a_subclass_of_a_force_element_has_its_force() -> None:
+    mechanism = srm.load("four_bar")
+    ends = [
+        srm.simulate(replace(mechanism, forces=[kind("crank", 20.0)]), 0.5).q[-1]
+        for kind in (srm.TorsionSpring, NamedSpring)
+    ]
+    np.testing.assert_array_equal(*ends)
 
 
 @pytest.mark.parametrize(

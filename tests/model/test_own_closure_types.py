@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -10,7 +12,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.analysis.summary import loop_rows
-from srm_mbs.model.closures import ClosureType, ClosureValues, RowSet
+from srm_mbs.model.closures import ClosureType, ClosureValues, JointRow, RowSet
 from tests.support.backends import needs_kernel
 from tests.support.mechanisms import add_link
 
@@ -58,3 +60,107 @@ def test_a_run_with_a_closure_type_of_ones_own_is_not_saved_and_says_so(tmp_path
     with pytest.raises(srm.InputError, match="closure type 'point_on_circle' is not one of the"):
         run.save(tmp_path / "run.npz")
     assert not (tmp_path / "run.npz").exists()
+
+
+ONE_AXIS = np.array([[0.0, 1.0, 0.0]])
+OF_PLANE = ("a", "b", "axis")
+
+
+@pytest.mark.parametrize(
+    ("rows", "problem"),
+    [
+        (lambda v: None, "the rows of the type 'own' are None. Return a RowSet"),
+        (lambda v: RowSet(("x",), v.axis), "are not unit vectors. Give an array of shape (n, 3)"),
+        (lambda v: RowSet(("x",), 2.0 * ONE_AXIS), "are not unit vectors"),
+        (lambda v: RowSet(("x",), np.nan * ONE_AXIS), "are not unit vectors"),
+        (lambda v: RowSet(("x",), alignments=ONE_AXIS), "Give an array of shape (n, 2, 3)"),
+        (lambda v: RowSet(("x",), distances=(np.nan,)), "the distances (nan,) are not positive"),
+        (lambda v: RowSet(("x",), distances=(-1.0,)), "the distances (-1.0,) are not positive"),
+        (lambda v: RowSet(("x", "y"), ONE_AXIS), "1 rows have the labels ('x', 'y')"),
+        (lambda v: RowSet(("x", "x"), np.eye(3)[:2]), "2 rows have the labels ('x', 'x')"),
+        (lambda v: RowSet(()), "0 rows have the labels ()"),
+    ],
+)
+def test_rows_that_cannot_be_evaluated_are_refused_with_their_closure(
+    rows: Callable[[ClosureValues], Any], problem: str
+) -> None:
+    own = ClosureType("own", OF_PLANE, rows, "of a test")
+    with pytest.raises(srm.InputError) as caught:
+        srm.LoopClosure(own, MASS, WORLD, axis=(0.0, 1.0, 0.0), name="c")
+    assert str(caught.value).startswith("loop 'c': ")
+    assert problem in str(caught.value)
+
+
+def test_rows_may_be_lists_and_integers() -> None:
+    own = ClosureType("own", OF_PLANE, lambda v: RowSet(["y"], [[0, 1, 0]]), "of a test")  # type: ignore[arg-type]
+    rows = srm.LoopClosure(own, MASS, WORLD, axis=(0.0, 1.0, 0.0)).rows
+    assert rows.labels == ("y",)
+    np.testing.assert_array_equal(rows.directions, ONE_AXIS)
+
+
+def test_a_type_that_needs_an_unknown_key_is_refused_with_the_keys_that_there_are() -> None:
+    own = ClosureType("own", ("a", "b", "radius"), _rows, "of a test")
+    with pytest.raises(srm.InputError, match="'own' needs or takes 'radius'.* Known: a, b, axis"):
+        srm.LoopClosure(own, MASS, WORLD)
+
+
+def test_rows_between_anchors_need_anchors() -> None:
+    own = ClosureType("own", ("axis",), lambda v: RowSet(("x",), v.axis[None]), "of a test")
+    with pytest.raises(srm.InputError, match="rows between anchors need a and b"):
+        srm.LoopClosure(own, axis=(0.0, 1.0, 0.0))
+
+
+JOINTS = ("first", "second")
+
+
+def _squared(values: ClosureValues) -> RowSet:
+    """q_first = ratio q_second^2."""
+    row = values.joint_row
+    factor = -row.coefficients[1]
+    own = JointRow(row.joints, (1.0, 0.0), arguments=(0.0, 1.0), powers=(factor,))
+    return RowSet(("square",), joint_rows=(own,))
+
+
+def test_a_relation_of_joints_of_ones_own_acts_and_is_shown_as_it_is() -> None:
+    square = ClosureType("square", ("joints", "ratio"), _squared, "of a test")
+    closure = srm.LoopClosure(square, joints=JOINTS, ratio=0.5, name="cam")
+    model = pin.Model()
+    for name in JOINTS:
+        add_link(model, 0, pin.JointModelRY(), name, pin.Inertia(1.0, np.zeros(3), np.eye(3)))
+    mechanism = srm.Mechanism(model, loops=[closure], q0=[0.5, 1.0], v0=[1.0, 1.0])
+    run = srm.simulate(mechanism, 1.0)
+    assert run.q[:, 0] == pytest.approx(0.5 * run.q[:, 1] ** 2, abs=1e-12)
+    assert list(loop_rows(mechanism))[0][3] == "+1 first = 0 +0.5 y^2, y = +1 second"
+
+
+@pytest.mark.parametrize(
+    ("rows", "problem"),
+    [
+        (lambda row: [JointRow(("first",), (1.0,))], "is not over the joints of the closure"),
+        (lambda row: [JointRow(("other",), (1.0,))], "is not over the joints of the closure"),
+        (lambda row: [JointRow(JOINTS, (1.0,))], "coefficients must be 2 finite numbers"),
+        (lambda row: [JointRow(JOINTS, (1.0, np.inf))], "coefficients must be 2 finite numbers"),
+        (lambda row: [JointRow(JOINTS, (1.0, 1.0), powers=(1.0,))], "arguments must be 2 finite"),
+        (lambda row: [row, JointRow(JOINTS, (1.0, 1.0))], "is joined with other rows"),
+    ],
+)
+def test_joint_rows_that_cannot_be_evaluated_are_refused(
+    rows: Callable[[JointRow], list[JointRow]], problem: str
+) -> None:
+    def own(values: ClosureValues) -> RowSet:
+        made = tuple(rows(values.joint_row))
+        return RowSet(tuple("xyz"[: len(made)]), joint_rows=made)
+
+    kind = ClosureType("own", ("joints", "ratio"), own, "of a test")
+    with pytest.raises(srm.InputError) as caught:
+        srm.LoopClosure(kind, joints=JOINTS, ratio=2.0)
+    assert problem in str(caught.value)
+
+
+def test_a_joint_row_beside_rows_between_anchors_is_refused() -> None:
+    def own(values: ClosureValues) -> RowSet:
+        return RowSet(("x", "gear"), values.axis[None], joint_rows=(values.joint_row,))
+
+    kind = ClosureType("own", (*OF_PLANE, "joints", "ratio"), own, "of a test")
+    with pytest.raises(srm.InputError, match="a joint row is joined with other rows"):
+        srm.LoopClosure(kind, MASS, WORLD, axis=(0.0, 1.0, 0.0), joints=JOINTS, ratio=2.0)

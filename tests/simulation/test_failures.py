@@ -72,6 +72,16 @@ def test_a_function_that_raises_at_its_first_call_raises_at_once(kind: str, back
 
 @backends
 @every_kind
+def test_a_function_of_other_arguments_is_named_with_what_python_says(
+    kind: str, backend: str
+) -> None:
+    """No line of it runs, so that the exception has no traceback of its own."""
+    with pytest.raises(srm.SrmError, match=r"raised TypeError\(.*takes 2 positional arguments"):
+        run(kind, lambda t, q: 0.0, backend=backend)  # type: ignore[misc]
+
+
+@backends
+@every_kind
 def test_a_function_that_returns_another_shape_at_first_raises_at_once(
     kind: str, backend: str
 ) -> None:

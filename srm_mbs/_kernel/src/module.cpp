@@ -974,7 +974,9 @@ public:
         if (!found.is_valid()) {
             nb::python_error error;
             if (!error.matches(PyExc_Exception)) throw error;
-            PyException_SetTraceback(error.value().ptr(), error.traceback().ptr());
+            // None where no line of Python ran, as with a wrong number of arguments.
+            if (error.traceback().is_valid())
+                PyException_SetTraceback(error.value().ptr(), error.traceback().ptr());
             event_.attr("fail")(error.value(), t);
             throw error;
         }

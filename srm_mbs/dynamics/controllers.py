@@ -67,12 +67,11 @@ def evaluate_controller(
     given = _output(name, controller, t, q, v)
     if isinstance(given, Mapping):
         return forces_of_joints(given, mechanism, t, "the controller's force")
-    result = _converted(name, given, t)
-    problem = _problem(result, len(v))
-    if problem is None:
+    result = _numbers(given, len(v))
+    if not isinstance(result, str):
         return result
     raise ControllerError(
-        f"{name} returned {problem} at t = {t:.6g} s; it must return {len(v)} finite generalised "
+        f"{name} returned {result} at t = {t:.6g} s; it must return {len(v)} finite generalised "
         "forces, or a mapping of joint names to them",
         t,
     )
@@ -98,14 +97,11 @@ def forces_of_joints(
             joint = mechanism.joint(name)
         except InputError as error:
             raise ControllerError(f"{own_name} at t = {t:.6g} s: {error}", t) from error
-        own = _converted(own_name, force, t)
-        if joint.nv == 1 and own.ndim == 0:
-            own = own.reshape(1)
-        problem = _problem(own, joint.nv)
-        if problem is not None:
+        own = _numbers(force, joint.nv, scalar=True)
+        if isinstance(own, str):
             wanted = "a finite number" if joint.nv == 1 else f"{joint.nv} finite numbers"
             raise ControllerError(
-                f"{own_name} is {problem} at t = {t:.6g} s; it must be {wanted}", t
+                f"{own_name} is {own} at t = {t:.6g} s; it must be {wanted}", t
             )
         tau[joint.idx_v : joint.idx_v + joint.nv] = own
     return tau
@@ -128,12 +124,11 @@ def evaluate_callback(
     ControllerError
         If it raises, or returns anything but ``size`` finite numbers.
     """
-    result = _converted(name, _output(name, function, t, q, v), t)
-    problem = _problem(result, size)
-    if problem is None:
+    result = _numbers(_output(name, function, t, q, v), size)
+    if not isinstance(result, str):
         return result
     raise ControllerError(
-        f"{name} returned {problem} at t = {t:.6g} s; it must return {size} finite {values}", t
+        f"{name} returned {result} at t = {t:.6g} s; it must return {size} finite {values}", t
     )
 
 
@@ -147,18 +142,17 @@ def _output(name: str, function: Controller, t: float, q: FloatArray, v: FloatAr
         raise ControllerError(f"{name} raised {safe_repr(error)} at t = {t:.6g} s", t) from error
 
 
-def _converted(name: str, given: Any, t: float) -> FloatArray:
-    """A copy of ``given`` as an array of numbers."""
+def _numbers(given: Any, size: int, scalar: bool = False) -> FloatArray | str:
+    """A copy of ``given`` as ``size`` finite numbers, or what it is instead; a ``scalar`` is one
+    number without an axis as well."""
     try:
-        return np.array(given, dtype=float, order="C")
-    except Exception as error:
-        raise ControllerError(f"{name} raised {safe_repr(error)} at t = {t:.6g} s", t) from error
-
-
-def _problem(result: FloatArray, size: int) -> str | None:
-    """Why ``result`` is not ``size`` finite numbers; None if it is."""
+        result = np.array(given, dtype=float, order="C")
+    except Exception:  # objects may raise anything
+        return safe_repr(given)
+    if scalar and size == 1 and result.ndim == 0:
+        result = result.reshape(1)
     if result.shape != (size,):
         return f"an array of shape {result.shape}"
     if not np.isfinite(result).all():
         return "values that are not finite"
-    return None
+    return result

@@ -402,7 +402,7 @@ class LoopClosure:
             if key not in keys:
                 raise self._fault(
                     f"the closure type {safe_repr(kind.name)} needs or takes {safe_repr(key)}, "
-                    "which is no key of a closure",
+                    "which closures do not have",
                     f"Known: {', '.join(keys)}",
                 )
         for entry in fields(self):

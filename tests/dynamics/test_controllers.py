@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -77,13 +78,22 @@ def test_a_linearisation_takes_forces_by_joint_name() -> None:
         ({"b": 1.0}, r"'b' is an array of shape \(\) .* it must be 3 finite numbers"),
         ({"b": [1.0, np.nan, 0.0]}, "'b' is values that are not finite"),
         ({"a": np.zeros(3)}, r"'a' is an array of shape \(3,\) .* 6 finite numbers"),
-        ({"c": "much"}, "'c' raised ValueError"),
+        ({"c": "much"}, "'c' is 'much' at t = 0 s; it must be 3 finite numbers"),
     ],
     ids=str,
 )
 def test_forces_that_do_not_fit_the_joints_are_named(given: Any, said: str) -> None:
     with pytest.raises(ControllerError, match=said):
         srm.simulate(floating_ring(), T_END, controller=lambda t, q, v: given)
+
+
+@pytest.mark.parametrize("backend", ["python", "kernel"])
+def test_a_force_of_the_user_that_returns_a_mapping_is_told_what_it_returned(backend: str) -> None:
+    force = srm.UserForce(lambda t, q, v: {"crank": 1.0}, name="push")
+    mechanism = replace(load("four_bar"), forces=[force])
+    said = r"'push' returned {'crank': 1.0} at t = 0 s; it must return 3 finite numbers"
+    with pytest.raises(ControllerError, match=said):
+        srm.simulate(mechanism, T_END, backend=backend)
 
 
 def test_a_joint_of_one_degree_of_freedom_takes_one_number() -> None:

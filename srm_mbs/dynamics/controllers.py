@@ -100,9 +100,7 @@ def forces_of_joints(
         own = _numbers(force, joint.nv, scalar=True)
         if isinstance(own, str):
             wanted = "a finite number" if joint.nv == 1 else f"{joint.nv} finite numbers"
-            raise ControllerError(
-                f"{own_name} is {own} at t = {t:.6g} s; it must be {wanted}", t
-            )
+            raise ControllerError(f"{own_name} is {own} at t = {t:.6g} s; it must be {wanted}", t)
         tau[joint.idx_v : joint.idx_v + joint.nv] = own
     return tau
 

@@ -100,7 +100,7 @@ def test_rows_may_be_lists_and_integers() -> None:
 
 def test_a_type_that_needs_an_unknown_key_is_refused_with_the_keys_that_there_are() -> None:
     own = ClosureType("own", ("a", "b", "radius"), _rows, "of a test")
-    with pytest.raises(srm.InputError, match="'own' needs or takes 'radius'.* Known: a, b, axis"):
+    with pytest.raises(srm.InputError, match=r"'own' needs or takes 'radius'.* Known: a, b, axis"):
         srm.LoopClosure(own, MASS, WORLD)
 
 
@@ -130,7 +130,7 @@ def test_a_relation_of_joints_of_ones_own_acts_and_is_shown_as_it_is() -> None:
     mechanism = srm.Mechanism(model, loops=[closure], q0=[0.5, 1.0], v0=[1.0, 1.0])
     run = srm.simulate(mechanism, 1.0)
     assert run.q[:, 0] == pytest.approx(0.5 * run.q[:, 1] ** 2, abs=1e-12)
-    assert list(loop_rows(mechanism))[0][3] == "+1 first = 0 +0.5 y^2, y = +1 second"
+    assert next(loop_rows(mechanism))[3] == "+1 first = 0 +0.5 y^2, y = +1 second"
 
 
 @pytest.mark.parametrize(

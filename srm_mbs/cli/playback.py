@@ -99,8 +99,11 @@ def image_options(
             )
     options: dict[str, Any] = {"t": at, "dpi": dpi}
     if size is not None:
+        # Matplotlib, which this imports, is slow to import.
+        from srm_mbs.visualization.plotting.print_size import WIDTHS
+
         options["size"] = size
-        if "," in size:
+        if size not in WIDTHS:
             try:
                 numbers = tuple(float(number) for number in size.split(","))
             except ValueError:

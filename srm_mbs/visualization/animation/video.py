@@ -321,7 +321,7 @@ def _checked_pixels(size: Any) -> tuple[int, int]:
     Raises
     ------
     InputError
-        Unless ``size`` is two positive whole numbers.
+        Unless ``size`` is two positive whole numbers of at most LARGEST_SIDE.
     """
     try:
         width, height = size
@@ -332,6 +332,23 @@ def _checked_pixels(size: Any) -> tuple[int, int]:
             f"size = {safe_repr(size)} is not a width and a height in pixels",
             element="size",
             remedy="Give for example size=(900, 600)",
+        )
+    return _drawable(width, height, "size", "a smaller size")
+
+
+def _drawable(width: int, height: int, element: str, instead: str) -> tuple[int, int]:
+    """Width and height, unless the browser does not draw as many pixels.
+
+    Raises
+    ------
+    InputError
+        About ``element``, if one is above LARGEST_SIDE.
+    """
+    if max(width, height) > LARGEST_SIDE:
+        raise InputError(
+            f"a picture of {width} by {height} pixels is larger than the browser draws",
+            element=element,
+            remedy=f"Give {instead}: up to {LARGEST_SIDE} pixels",
         )
     return width, height
 
@@ -369,13 +386,7 @@ def _print(size: Any, dpi: float | None) -> tuple[tuple[int, int], float]:
     density = PRINT_RESOLUTION if dpi is None else checked_resolution(dpi)
     inches = (WIDTHS[size], WIDTHS[size] / 1.5) if isinstance(size, str) else size
     width, height = (round(side * density) for side in inches)
-    if max(width, height) > LARGEST_SIDE:
-        raise InputError(
-            f"a picture of {width} by {height} pixels is larger than the browser draws",
-            element="dpi",
-            remedy=f"Give a smaller size or fewer dots per inch: up to {LARGEST_SIDE} pixels",
-        )
-    return (width, height), density
+    return _drawable(width, height, "dpi", "a smaller size or fewer dots per inch"), density
 
 
 def _with_density(picture: bytes, density: float) -> bytes:

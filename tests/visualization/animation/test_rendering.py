@@ -251,7 +251,9 @@ def test_the_command_line_gives_an_image_its_size_for_print(tmp_path: Path) -> N
         (["--image", "a.png", "--size", "9,x"], "--size: '9,x' is not a size"),
         (["--image", "a.png", "--size", "0,600"], "is not a width and a height in pixels"),
         (["--image", "a.png", "--size", "4.5,600"], "is not a width and a height in pixels"),
-        (["--image", "a.png", "--size", "poster"], "is not the size of a figure"),
+        (["--image", "a.png", "--size", "poster"], "'poster' is not a size. Write 900,600"),
+        (["--image", "a.png", "--size", "900x600"], "'900x600' is not a size. Write 900,600"),
+        (["--image", "a.png", "--size", "9000,600"], "larger than the browser draws"),
         (["--image", "a.png", "--size", "90,60", "--dpi", "300"], "larger than the browser draws"),
     ],
 )

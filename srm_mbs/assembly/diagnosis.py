@@ -14,6 +14,7 @@ from srm_mbs.assembly.continuation import CLOSE, drag
 from srm_mbs.assembly.position import ClosureProblem, assemble_positions, beyond_limits
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.scaling import is_angle
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR, smallest_singular_value
 from srm_mbs.errors import AssemblyError
 from srm_mbs.model.coordinates import free_coordinates, joint_coordinates, position_of
@@ -130,7 +131,10 @@ def cannot_close(
     if len(guilty) < len(held) or len(held) == 1:
         remedy = f"Change or free one of {quoted(guilty)}: with it free, the loops close"
     if nearest:
-        values = ", ".join(f"{name} = {value:.9g}" for name, value in nearest.items())
+        values = ", ".join(
+            f"{name} = {value:.9g} {'rad' if is_angle(mechanism.model, name) else 'm'}"
+            for name, value in nearest.items()
+        )
         remedy += f"; nearest values that close, one at a time: {values}"
     return AssemblyError(
         f"the loops cannot close with the held values of {quoted(held)}; {remaining}",

@@ -109,7 +109,13 @@ def read_csv(path: Path) -> CsvTable:
     with open_regular(path, LARGEST_TABLE) as stream, naming(file=str(path)):
         try:
             return _Reader(str(path)).table(stream)
-        except (OSError, UnicodeDecodeError, csv.Error) as error:
+        except UnicodeDecodeError as error:
+            raise InputError(
+                f"it is not UTF-8 text: {error.reason}",
+                file=str(path),
+                remedy="Save it as UTF-8",
+            ) from error
+        except (OSError, csv.Error) as error:
             raise InputError(
                 f"the table cannot be read: {shortened(str(error))}",
                 file=str(path),

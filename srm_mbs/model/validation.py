@@ -59,7 +59,8 @@ def check_inertia(model: pin.Model, file: str | None = None) -> None:
             f"neither {links(joint)} nor anything that it carries has inertia",
             file=file,
             element=f"joint {model.names[joint]!r}",
-            remedy=f"Give the moving end of the chain an <inertial>{LOADED if file else ''}",
+            remedy="Give the moving end of the chain a mass (<inertial> of a URDF)"
+            f"{LOADED if file else ''}",
         )
     q = pin.integrate(model, pin.neutral(model), _motion(model.nv))
     at = undetermined_joint(model, q, file)

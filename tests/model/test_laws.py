@@ -155,6 +155,10 @@ def test_malformed_laws_and_tables_are_refused(tmp_path: Path) -> None:
         path = tmp_path / f"{case}.csv"
         path.write_text(text)
         messages[case] = refused(lambda path=path: read_csv(path).columns(("t", "value")), tmp_path)
+    (tmp_path / "wide.csv").write_bytes("t,value\n0,1\n".encode("utf-16"))
+    messages["a text of a spreadsheet in UTF-16"] = refused(
+        partial(read_csv, tmp_path / "wide.csv"), tmp_path
+    )
     messages["no file"] = refused(partial(read_csv, tmp_path / "none.csv"), tmp_path)
     check_messages("laws", messages)
 

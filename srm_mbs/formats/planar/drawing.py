@@ -248,8 +248,12 @@ class Drawing:
                 f"its points {names} are on the ground: it cannot move",
                 "Remove the bar, or one of the points from ground",
             )
-        if bar.mass is None and bar.mass_per_length is None and self.entry.mass_per_length is None:
+        given = (bar.mass, bar.mass_per_length, self.entry.mass_per_length)
+        mass = next((number for number in given if number is not None), None)
+        if mass is None:
             raise fault(element, "it has no mass", "Give mass_per_length (kg/m), or its mass (kg)")
+        if bar.inertia and not mass:
+            raise fault(element, "it has a moment of inertia without mass", "Give its mass (kg)")
         if bar.mass is not None and bar.mass_per_length is not None:
             raise fault(element, "mass and mass_per_length are given", "Give one of them")
         if bar.length is not None and not (
@@ -285,6 +289,8 @@ class Drawing:
                 f"nothing moves with it: no bar has the point {slider.point!r}",
                 "Give it a mass, or a bar with this point",
             )
+        if slider.inertia and not slider.mass:
+            raise fault(element, "it has a moment of inertia without mass", "Give its mass (kg)")
         self.direction(slider)
 
     def _check_use(self) -> None:

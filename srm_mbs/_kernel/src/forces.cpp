@@ -257,6 +257,7 @@ double energy(const ForceElement& e, const pinocchio::Data& data, const double* 
 }  // namespace
 
 void ForceElement::check() const {
+    expect_within("kind", static_cast<int>(kind), 0, static_cast<int>(last_force_kind));
     expect_size("signs", signs.size(), columns.size());
     if (kind == ForceKind::wrench) expect_size("numbers", numbers.size(), 6);
     if (kind == ForceKind::bushing) expect_size("numbers", numbers.size(), 12);

@@ -23,6 +23,7 @@ enum class ForceKind {
     limit_spring,
     coupling_spring,
 };
+inline constexpr ForceKind last_force_kind = ForceKind::coupling_spring;
 
 using Placement = std::array<double, 12>;  // rotation row by row, translation
 

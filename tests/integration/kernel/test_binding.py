@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.multibody import ClosedSystem
+from srm_mbs.integration.generated.terms import FORCE_KINDS
 from srm_mbs.integration.kernel import backend, marshalling
 from srm_mbs.integration.methods.base import IntegratorState
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
@@ -78,6 +80,17 @@ def test_arrays_of_another_size_are_refused() -> None:
             core.SystemData(**given | {name: given[name][1:]})
     with pytest.raises(ValueError, match=re.escape("Anchor.placement has another type or size")):
         core.Anchor(joint=1, placement=np.zeros(11))
+
+
+def test_a_force_of_a_kind_that_the_kernel_has_no_formula_for_is_refused() -> None:
+    spring = replace(load("four_bar"), forces=[srm.TorsionSpring("crank", 1.0)])
+    (force,) = marshalling.system_struct(ClosedSystem(spring).constants()).forces
+    given = fields(force)
+    assert fields(core.ForceElement(**given))["kind"] == FORCE_KINDS.index("torsion_spring")
+    for kind in (-1, len(FORCE_KINDS)):
+        with pytest.raises(ValueError, match=f"ForceElement.kind has {kind}, outside of 0 to"):
+            core.ForceElement(**given | {"kind": kind})
+    core.ForceElement(**given | {"kind": len(FORCE_KINDS) - 1})
 
 
 def test_a_state_of_another_size_is_refused() -> None:

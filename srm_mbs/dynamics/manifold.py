@@ -82,17 +82,12 @@ def group_joints(model: pin.Model) -> tuple[GroupJoint, ...]:
     Raises
     ------
     InputError
-        If a joint has nq != nv and is not one of these (a composite joint with a ball inside, a
-        mimic joint).
+        If a joint has nq != nv and is not one of these (a composite joint with a ball inside).
     """
     found = []
     for joint_id in range(1, model.njoints):
         joint = model.joints[joint_id]
         name, kind = model.names[joint_id], joint.shortname()
-        if "Mimic" in kind:
-            raise InputError(
-                f"joint {name!r} is a Pinocchio mimic joint", remedy="Build the model without it"
-            )
         if joint.nq == joint.nv or joint.nv == 1:
             continue
         group = {

@@ -25,7 +25,8 @@ class Mechanism(MechanismData):
     ----------
     model
         The spanning tree, gravity included; ``model.damping`` acts on the joints (N m s/rad,
-        N s/m), and ``model.friction`` F (N m, N) with -F tanh(v / friction_speed).
+        N s/m), and ``model.friction`` F (N m, N) with -F tanh(v / friction_speed).  It is not
+        copied, and what follows from it is kept: to change it, make a mechanism of a copy.
     loops
         Loop closures; names must be unique.  A ``distance`` without a length takes the one at q0.
     q0 : (nq,), v0 : (nv,)
@@ -54,8 +55,9 @@ class Mechanism(MechanismData):
     ------
     InputError
         If names repeat, an anchor or the joint of a force, drive or coupling is unknown or cannot
-        take it, a shape does not fit, the joints of the model are not in depth-first order, joint
-        friction is negative, or it has mimic joints, which this version does not simulate.
+        take it, a shape does not fit, the joints of the model are not in depth-first order or share
+        a name, joint friction is negative, or it has mimic joints, which this version does not
+        simulate.
     """
 
     @property

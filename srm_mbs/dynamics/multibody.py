@@ -461,7 +461,7 @@ class Mechanics(Manifold):
         their M-orthonormal ``normals`` N (nv, k): da = (M^-1 - N N^T) (df - dID), ID the inverse
         dynamics."""
         model = self.model
-        if len(model.mimicking_joints) or model.gravity.angular.any():
+        if model.gravity.angular.any():
             return None
         q, v = state[: self.nq], state[self.nq :]
         by_q, by_v, M = pin.computeRNEADerivatives(model, self.data, q, v, accelerations)

@@ -6,6 +6,7 @@ A tree must be in Pinocchio's order of joints, and its inertias must determine i
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Protocol, TypeVar
@@ -146,13 +147,13 @@ def undetermined_joint(
 
 
 def check_tree(model: pin.Model) -> None:
-    """Refuse a tree that cannot move, or whose joints are not in depth-first order, or where
-    gravity or damping is not finite, or damping negative.
+    """Refuse a tree that cannot move, or whose joints are not in depth-first order, share a name or
+    mimic others, or where gravity or damping is not finite, or damping negative.
 
     Raises
     ------
     InputError
-        Naming the fault, or the joint that is out of order.
+        Naming the fault, or the joint at fault.
     """
     if model.nv == 0:
         raise InputError(
@@ -178,6 +179,21 @@ def check_tree(model: pin.Model) -> None:
             element="model.damping",
             remedy="Give no negative numbers; a force that feeds energy in is an srm.UserForce",
         )
+    names = vector_elements(model.names)
+    for joint in vector_elements(model.mimicking_joints):
+        raise InputError(
+            f"the joint {safe_repr(names[joint])} is a Pinocchio mimic joint",
+            element="model",
+            remedy="Build the model without it, with a joint of its own and the closure "
+            'srm.LoopClosure("coupling", joints=..., ratio=...)',
+        )
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise InputError(
+                f"{count} joints have the name {safe_repr(name)}",
+                element="model",
+                remedy="Give every joint a name of its own; that of the root is universe",
+            )
     _check_order(model)
 
 

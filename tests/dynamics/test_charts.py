@@ -240,13 +240,6 @@ def test_a_composite_of_one_degree_joints_needs_no_chart() -> None:
     assert group_joints(single(composite(pin.JointModelRX(), pin.JointModelPY()))) == ()
 
 
-def test_a_mimic_joint_is_refused_by_name() -> None:
-    model = single(pin.JointModelRX(), pin.JointModelRX())
-    mimicking = pin.transformJointIntoMimic(model, 1, 2, 2.0, 0.0)
-    with pytest.raises(srm.InputError, match="'joint_1' is a Pinocchio mimic joint"):
-        group_joints(mimicking)
-
-
 # --- the chart of a whole mechanism -------------------------------------------------------------
 
 

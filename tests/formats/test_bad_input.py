@@ -701,6 +701,29 @@ def test_a_name_in_the_place_of_an_anchor_is_refused(made: Any) -> None:
         made()
 
 
+def chain_of_two(first: str, second: str) -> pin.Model:
+    model = pin.Model()
+    for parent, name in enumerate((first, second)):
+        joint = model.addJoint(parent, pin.JointModelRY(), pin.SE3.Random(), name)
+        body = pin.Inertia(1.0, np.array([0.5, 0.0, 0.0]), 0.1 * np.eye(3))
+        model.appendBodyToJoint(joint, body, pin.SE3.Identity())
+    return model
+
+
+def test_joints_of_one_name_are_refused() -> None:
+    with pytest.raises(srm.InputError, match="model: 2 joints have the name 'knee'"):
+        srm.Mechanism(chain_of_two("knee", "knee"))
+    with pytest.raises(srm.InputError, match="model: 2 joints have the name 'universe'"):
+        srm.Mechanism(chain_of_two("knee", "universe"))
+
+
+def test_a_mimic_joint_is_refused_by_name_with_the_closure_that_does_the_same() -> None:
+    model = chain_of_two("hip", "knee")
+    mimicking = pin.transformJointIntoMimic(model, 1, 2, 2.0, 0.0)
+    with pytest.raises(srm.InputError, match=r"'knee' is a Pinocchio mimic joint.*\"coupling\""):
+        srm.Mechanism(mimicking)
+
+
 class OwnForce(srm.ForceElement):
     """A force element whose force the equations do not know."""
 

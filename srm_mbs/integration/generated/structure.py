@@ -389,8 +389,6 @@ def structure_of(model: pin.Model, constants: Mapping[str, Any]) -> tuple[Struct
         If no code can be generated for an element.
     """
     numbers = _Numbers()
-    if len(model.mimicking_joints):
-        raise UnsupportedElementError("the model has mimic joints")
     motions, bodies = _tree(model, numbers)
     fields: dict[str, Any] = {
         "nq": int(model.nq),

@@ -435,13 +435,17 @@ def read(name: str | Path, overrides: Overrides) -> Reading:
         For anything that cannot be read, naming file, element and remedy.
     """
     try:
-        name = str(name)
-    except Exception as error:  # objects may raise anything
+        given = os.fspath(name)
+    except Exception:  # objects may raise anything
+        given = None
+    if not isinstance(given, str):
         raise InputError(
-            f"a {type(name).__name__} is not a name or a path",
+            f"{type(name).__name__} is not a type of names and paths",
             element="path",
-            remedy="Give a bundled mechanism or the path of a file",
-        ) from error
+            remedy="Give a bundled mechanism or the path of a file; srm.Mechanism takes a "
+            "pinocchio.Model",
+        )
+    name = str.__str__(given)  # a subclass formats itself as it likes
     is_name = not Path(name).suffix and "/" not in name and "\\" not in name
     if is_name and name in bundled_models():
         name = str(models_folder() / f"{name}.toml")

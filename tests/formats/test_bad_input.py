@@ -701,6 +701,14 @@ def test_a_name_in_the_place_of_an_anchor_is_refused(made: Any) -> None:
         made()
 
 
+@pytest.mark.parametrize("given", [pin.Model(), None, 3, b"four_bar", ["four_bar"]], ids=repr)
+def test_what_is_no_name_and_no_path_is_not_searched_among_the_bundled_names(given: Any) -> None:
+    with pytest.raises(srm.InputError) as caught:
+        srm.load(given)
+    assert f"{type(given).__name__} is not a type of names and paths" in str(caught.value)
+    assert "srm.Mechanism takes a pinocchio.Model" in str(caught.value)
+
+
 def chain_of_two(first: str, second: str) -> pin.Model:
     model = pin.Model()
     for parent, name in enumerate((first, second)):

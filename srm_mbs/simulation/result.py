@@ -99,6 +99,8 @@ class Settings:
     stiff: tuple[tuple[float, float], ...] = ()
     """Intervals (s) in which the problem was found to be stiff: the tableau ``auto`` has its scheme
     for stiff problems there, others are limited by their stability."""
+    user_forces: bool = False
+    """Whether there was a :class:`~srm_mbs.model.forces.UserForce` among the forces."""
 
 
 ATTEMPT = np.dtype([("t", float), ("h", float), ("error_ratio", float), ("verdict", "U8")])
@@ -637,17 +639,22 @@ class SimulationResult(RunOutcome):
         Raises
         ------
         InputError
-            For a loaded run that had a controller.
+            For a loaded run that had a controller or a ``UserForce``.
         """
         self._need_controller("energy balance")
         return energy_balance(self, self._system)
 
     def _need_controller(self, what: str) -> None:
-        acting = self._system.controlled or self._system.has_user_forces
-        if self._run.controlled and not acting:
+        system = self._system
+        if not self._run.controlled or system.has_user_forces:
+            return
+        # What a sampled controller held is saved, which the system has in its place.
+        of_forces = self.settings.user_forces
+        if of_forces or not system.controlled:
+            lost = "UserForce" if of_forces else "controller"
             raise InputError(
-                f"the {what} of a loaded run with a controller cannot be computed: "
-                "controllers are not saved",
+                f"the {what} of a loaded run with a {lost} cannot be computed: "
+                f"{'their functions' if of_forces else 'controllers'} are not saved",
                 remedy="Read it before saving, or simulate again",
             )
 

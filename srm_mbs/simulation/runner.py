@@ -818,6 +818,7 @@ def settings(
     controlled: bool,
     backend: str,
     stiff: Sequence[tuple[float, float]] = (),
+    user_forces: bool = False,
 ) -> Settings:
     """The settings of a run that was made with ``options``; ``stiff``: where it was (s)."""
     return Settings(
@@ -832,6 +833,7 @@ def settings(
         backend,
         options.singular_tolerance,
         tuple(stiff),
+        user_forces,
     )
 
 
@@ -942,7 +944,12 @@ class FinishedRun:
     @cached_property
     def settings(self) -> Settings:
         return settings(
-            self._options, self._norm, self.controlled, self.backend, self._stiff_intervals
+            self._options,
+            self._norm,
+            self.controlled,
+            self.backend,
+            self._stiff_intervals,
+            self._system.has_user_forces,
         )
 
     @property

@@ -160,6 +160,7 @@ class SettingsEntry(StrictData):
     singular_times: Numbers = Field(default_factory=list)
     backend: Literal["python", "kernel", "generated"] = "python"
     singular_tolerance: Tolerance = SINGULAR_TOLERANCE
+    user_forces: bool = False
 
 
 class StatisticsEntry(StrictData):

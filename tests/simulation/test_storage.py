@@ -167,6 +167,39 @@ def test_reactions_of_a_controlled_run_are_refused_after_loading(tmp_path: Path)
         _ = reloaded(solution, tmp_path).reactions
 
 
+@pytest.mark.parametrize("sample_time", [None, 0.02])
+def test_what_needs_a_force_of_the_user_is_refused_after_loading(
+    sample_time: float | None, tmp_path: Path
+) -> None:
+    """Also where the output of the sampled controller, which acted as well, is saved."""
+    push = srm.UserForce(lambda t, q, v: np.array([0.0, 0.0, 3.0]), name="push")
+    mechanism = replace(srm.load("four_bar"), forces=[push])
+    options = {} if sample_time is None else {"controller": lambda t, q, v: -v}
+    solution = srm.simulate(mechanism, 0.1, sample_time=sample_time, **options)
+    loaded = reloaded(solution, tmp_path)
+    np.testing.assert_array_equal(loaded.q, solution.q)
+    np.testing.assert_allclose(loaded(0.05)[0], solution(0.05)[0], atol=1e-14)
+    for read in (
+        lambda run: run.reactions,
+        lambda run: run.joint_reactions,
+        lambda run: run.energy_balance,
+        lambda run: run.accelerations,
+    ):
+        read(solution)
+        with pytest.raises(srm.InputError, match="with a UserForce cannot be computed"):
+            read(loaded)
+
+
+def test_a_run_with_a_sampled_controller_alone_has_its_reactions_after_loading(
+    tmp_path: Path,
+) -> None:
+    solution = srm.simulate(
+        srm.load("four_bar"), 0.1, controller=lambda t, q, v: -v, sample_time=0.02
+    )
+    loaded = reloaded(solution, tmp_path)
+    np.testing.assert_array_equal(loaded.reactions["pin"], solution.reactions["pin"])
+
+
 def test_the_file_needs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = srm.load("four_bar").source
     assert source is not None

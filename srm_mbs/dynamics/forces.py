@@ -813,9 +813,7 @@ class ForceKinematics:
         self._elements: list[Evaluator] = [
             CouplingSpringEvaluator(model, force, friction_speed)
             if isinstance(force, CouplingSpring)
-            else next(made for kind, made in _EVALUATORS.items() if isinstance(force, kind))(
-                model, force
-            )
+            else _EVALUATORS[type(force)](model, force)
             for force in forces
         ]
 

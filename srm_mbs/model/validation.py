@@ -240,7 +240,7 @@ def checked_elements(
         parts: tuple[Any, ...] = tuple(given) if several else (given,)
     except Exception:  # objects may raise anything
         several, parts = False, (given,)
-    if not several or not all(isinstance(part, types) for part in parts):
+    if not several or not all(type(part) in types for part in parts):
         raise InputError(
             f"{what}s = {safe_repr(given)} is not a list of {what}s",
             element=f"{what}s",

@@ -24,7 +24,7 @@ import pinocchio as pin
 
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
-from srm_mbs.errors import InputError, get_logger
+from srm_mbs.errors import InputError, get_logger, joined_names
 from srm_mbs.formats.archive import (
     LARGEST_CONTENT,
     LARGEST_RATIO,
@@ -47,7 +47,7 @@ from srm_mbs.model.actuators import Actuator
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive
-from srm_mbs.model.forces import FORCE_TYPES, ForceElement
+from srm_mbs.model.forces import FORCE_TYPES, ForceElement, UserForce
 from srm_mbs.model.laws import Curve, Law, Samples
 from srm_mbs.model.mechanism import SimulationDefaults, Source, SourceTexts
 from srm_mbs.model.model_data import model_from_data, model_to_data
@@ -222,10 +222,16 @@ def _source_entry(source: Source, full_paths: bool) -> dict[str, Any]:
 
 
 def _notes(mechanism: Mechanism, full_paths: bool) -> list[str]:
-    source = mechanism.source
-    if source is None or full_paths:
-        return list(mechanism.notes)
-    return [source.without_folders(note) for note in mechanism.notes]
+    source, notes = mechanism.source, list(mechanism.notes)
+    if source is not None and not full_paths:
+        notes = list(map(source.without_folders, notes))
+    lost = [repr(force.name) for force in mechanism.forces if isinstance(force, UserForce)]
+    if lost:
+        notes.append(
+            f"functions of the user are not saved, so that these forces do not act: "
+            f"{joined_names(lost)}"
+        )
+    return notes
 
 
 def _run_arrays(solution: SimulationResult, path: Path, full_paths: bool) -> dict[str, Any]:

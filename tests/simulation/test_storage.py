@@ -177,6 +177,7 @@ def test_what_needs_a_force_of_the_user_is_refused_after_loading(
     options = {} if sample_time is None else {"controller": lambda t, q, v: -v}
     solution = srm.simulate(mechanism, 0.1, sample_time=sample_time, **options)
     loaded = reloaded(solution, tmp_path)
+    assert "these forces do not act: 'push'" in loaded.mechanism.notes[-1]
     np.testing.assert_array_equal(loaded.q, solution.q)
     np.testing.assert_allclose(loaded(0.05)[0], solution(0.05)[0], atol=1e-14)
     for read in (

@@ -22,7 +22,8 @@ FEW = 32
 def finite_array(
     values: Any, shape: tuple[int | None, ...] | None = None, *, new: bool = True
 ) -> FloatArray | None:
-    """``values`` as an array; None unless it is real, finite and of that shape.
+    """``values`` as an array; None unless it is real, finite, without masked elements, and of that
+    shape.
 
     Parameters
     ----------
@@ -37,8 +38,8 @@ def finite_array(
         return (values.copy() if new else values) if _all_finite(values) else None
     try:
         given = np.asarray(values)
-        if given.dtype.kind == "c":  # NumPy drops imaginary parts with no more than a warning
-            return None
+        if given.dtype.kind == "c" or np.ma.is_masked(values):
+            return None  # NumPy drops imaginary parts with no more than a warning, and masks
         array: FloatArray = given.astype(float, copy=new)
     except Exception:  # objects may raise anything
         return None

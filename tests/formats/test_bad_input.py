@@ -709,6 +709,15 @@ def test_what_is_no_name_and_no_path_is_not_searched_among_the_bundled_names(giv
     assert "srm.Mechanism takes a pinocchio.Model" in str(caught.value)
 
 
+def test_numbers_with_masked_elements_are_refused() -> None:
+    """What lies below the mask is no number of the state."""
+    mechanism = srm.load("four_bar")
+    whole = np.ma.array(mechanism.q0)
+    assert srm.simulate(mechanism, 0.1, q0=whole).success
+    with pytest.raises(srm.InputError, match="q0 does not consist of 3 finite numbers"):
+        srm.simulate(mechanism, 0.1, q0=np.ma.array(mechanism.q0, mask=[False, True, False]))
+
+
 def chain_of_two(first: str, second: str) -> pin.Model:
     model = pin.Model()
     for parent, name in enumerate((first, second)):

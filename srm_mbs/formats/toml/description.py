@@ -430,8 +430,6 @@ PROBLEMS: dict[str, tuple[str | None, str]] = {
     "greater_than_equal": (None, "Give a number of at least 0"),
     "massless": (None, 'Write "fix", or { mass = m, inertia = I } with positive numbers'),
     "direction": (None, "Give an angle, [x, y], or the names of two points"),
-    "too_short": (None, "Give the right number of values"),
-    "too_long": (None, "Give the right number of values"),
     "literal_error": (None, "Choose one of those"),
     "bool_type": ("true or false is wanted", "Write true or false without quotes"),
 }
@@ -454,6 +452,10 @@ def _explain(error: ValidationError) -> tuple[str, str, str]:
         return f"{key}.type", f"there is no force type {_shortened(tag)}", known
     if first["type"] == "missing":
         return key, "this key is missing", "Add it"
+    if first["type"] in ("too_short", "too_long"):  # lists have one length
+        (count,) = {first["ctx"].get(bound) for bound in ("min_length", "max_length")} - {None}
+        given = _shortened(first.get("input"))
+        return key, f"{count} values are wanted, not {given}", f"Give {count} values"
     message = f"{first['msg'][0].lower()}{first['msg'][1:]}"
     problem, remedy = PROBLEMS.get(first["type"], (None, "Correct the value"))
     if location[0] == "initial" and first["type"] == "number":

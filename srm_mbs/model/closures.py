@@ -397,14 +397,8 @@ class LoopClosure:
                 f"Known: {', '.join(CLOSURE_TYPES)}",
             )
         kind = self.kind
-        keys = [entry.name for entry in fields(self) if entry.name not in _ALWAYS]
-        for key in (*kind.needs, *kind.takes):
-            if key not in keys:
-                raise self._fault(
-                    f"the closure type {safe_repr(kind.name)} needs or takes {safe_repr(key)}, "
-                    "which closures do not have",
-                    f"Known: {', '.join(keys)}",
-                )
+        if not known:
+            self._check_keys_of(kind)
         for entry in fields(self):
             key, missing = entry.name, getattr(self, entry.name) is None
             if missing and key in kind.needs:
@@ -421,8 +415,19 @@ class LoopClosure:
         if self.joints is not None:
             self._take_joints(self.joints)
         self._take_without()
-        if isinstance(self.type, ClosureType):
+        if not known:
             _ = self.rows  # which checks them
+
+    def _check_keys_of(self, kind: ClosureType) -> None:
+        """Refuse keys of a type of the user that closures do not have."""
+        keys = [entry.name for entry in fields(self) if entry.name not in _ALWAYS]
+        for key in (*kind.needs, *kind.takes):
+            if key not in keys:
+                raise self._fault(
+                    f"the closure type {safe_repr(kind.name)} needs or takes {safe_repr(key)}, "
+                    "which closures do not have",
+                    f"Known: {', '.join(keys)}",
+                )
 
     def between(self, a: Anchor, b: Anchor) -> LoopClosure:
         """The same closure between other places."""
@@ -643,8 +648,10 @@ class LoopClosure:
             raise self._fault(
                 "rows between anchors need a and b", "Put both among the needs of the type"
             )
-        labels, count = _listed(rows.labels), anchored + len(joint_rows)
-        if not count or isinstance(rows.labels, str) or len(set(labels)) != count:
+        labels = () if isinstance(rows.labels, str) else _listed(rows.labels)
+        count = anchored + len(joint_rows)
+        named = all(isinstance(label, str) for label in labels)
+        if not (count and named and count == len(labels) == len(set(labels))):
             raise self._fault(
                 f"{count} rows have the labels {safe_repr(rows.labels)}",
                 "Give at least one row, and each a label of its own",

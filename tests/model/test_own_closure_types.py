@@ -78,6 +78,9 @@ OF_PLANE = ("a", "b", "axis")
         (lambda v: RowSet(("x",), distances=(-1.0,)), "the distances (-1.0,) are not positive"),
         (lambda v: RowSet(("x", "y"), ONE_AXIS), "1 rows have the labels ('x', 'y')"),
         (lambda v: RowSet(("x", "x"), np.eye(3)[:2]), "2 rows have the labels ('x', 'x')"),
+        (lambda v: RowSet(("x", "x"), ONE_AXIS), "1 rows have the labels ('x', 'x')"),
+        (lambda v: RowSet("x", ONE_AXIS), "1 rows have the labels 'x'"),
+        (lambda v: RowSet(([],), ONE_AXIS), "1 rows have the labels ([],)"),
         (lambda v: RowSet(()), "0 rows have the labels ()"),
     ],
 )

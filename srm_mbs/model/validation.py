@@ -187,13 +187,13 @@ def check_tree(model: pin.Model) -> None:
             remedy="Build the model without it, with a joint of its own and the closure "
             'srm.LoopClosure("coupling", joints=..., ratio=...)',
         )
-    for name, count in Counter(names).items():
-        if count > 1:
-            raise InputError(
-                f"{count} joints have the name {safe_repr(name)}",
-                element="model",
-                remedy="Give every joint a name of its own; that of the root is universe",
-            )
+    if len(set(names)) < len(names):
+        ((name, count),) = Counter(names).most_common(1)
+        raise InputError(
+            f"{count} joints have the name {safe_repr(name)}",
+            element="model",
+            remedy="Give every joint a name of its own; that of the root is universe",
+        )
     _check_order(model)
 
 

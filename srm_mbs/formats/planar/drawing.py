@@ -289,8 +289,6 @@ class Drawing:
                 f"nothing moves with it: no bar has the point {slider.point!r}",
                 "Give it a mass, or a bar with this point",
             )
-        if slider.inertia and not slider.mass:
-            raise fault(element, "it has a moment of inertia without mass", "Give its mass (kg)")
         self.direction(slider)
 
     def _check_use(self) -> None:

@@ -436,9 +436,6 @@ def refusals() -> dict[str, Callable[[], object]]:
         "structure": case(**triangle, bars={"left": ("O", "A"), "right": ("A", "C")}),
         "no mass": case(mass_per_length=None),
         "inertia without mass": case(masses={"coupler": 0.0}, inertias={"coupler": 1e-4}),
-        "inertia of a slider without mass": case(
-            PRESS, sliders={"ram": {"point": "D", "along": (0, 1), "inertia": 1.0}}
-        ),
         "bar without mass at a moving end": case(masses={"coupler": 0.0}),
         "two masses": case(
             bars=BARS | {"crank": {"points": ["O", "A"], "mass": 1.0, "mass_per_length": 1.0}}

@@ -9,11 +9,6 @@ namespace srm {
 
 namespace {
 
-typedef double Lanes __attribute__((vector_size(8 * lanes), aligned(8), may_alias));
-
-inline Lanes& at(double* x) { return *reinterpret_cast<Lanes*>(x); }
-inline const Lanes& at(const double* x) { return *reinterpret_cast<const Lanes*>(x); }
-
 template <int count>
 using Vectors = std::integral_constant<int, count>;
 

@@ -12,6 +12,9 @@ namespace srm {
 
 // Doubles of a vector of AVX2.
 constexpr int lanes = 4;
+typedef double Lanes __attribute__((vector_size(8 * lanes), aligned(8), may_alias));
+inline Lanes& at(double* x) { return *reinterpret_cast<Lanes*>(x); }
+inline const Lanes& at(const double* x) { return *reinterpret_cast<const Lanes*>(x); }
 constexpr int padded(int count) { return (count + lanes - 1) / lanes * lanes; }
 
 // Replaces the rows of T = [M | B] (n, width) by those of [L | L^-T B], M = L^T L, from the last to

@@ -36,21 +36,7 @@ public:
         std::fill_n(last.begin(), sets, -1);
     }
 
-    // Makes them those of `from`, which are as many and as large.
-    void restore(const BitSets& from) {
-        for (std::size_t which = 0; which < first.size(); ++which) {
-            Word* const own = &words_[which * stride_];
-            for (int w = first[which]; w <= last[which]; ++w) own[w] = 0;
-            first[which] = from.first[which];
-            last[which] = from.last[which];
-            const Word* const others = &from.words_[which * stride_];
-            for (int w = first[which]; w <= last[which]; ++w) own[w] = others[w];
-        }
-    }
-
     void set(int which, int i) { add(which, Word{1} << (i & 63), i >> 6); }
-
-    void remove(int which, int i) { unset(&words_[which * stride_], i); }
 
     // The bits of word w.
     void add(int which, Word bits, int w) {

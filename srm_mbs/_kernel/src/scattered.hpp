@@ -26,13 +26,6 @@ inline void scattered(double a, const double* values, const int* rows, int n, do
 
 // x = (1 - tau v v^T) x
 inline void reflected(double tau, const double* v, const int* rows, int n, double* x) {
-    if (n == 2) {  // as in most reflections of long chains of loops
-        double &a = x[rows[0]], &b = x[rows[1]];
-        const double s = tau * (v[0] * a + v[1] * b);
-        a -= s * v[0];
-        b -= s * v[1];
-        return;
-    }
     scattered(-tau * gathered(v, rows, n, x), v, rows, n, x);
 }
 

@@ -54,6 +54,8 @@ public:
 protected:
     // Computes pivots_, Q and R, and clears the columns of W.
     virtual void pivoted_qr(double floor);
+    virtual void times_q(double* x) const;
+    virtual void times_q_transposed(double* x) const;
     // G^T, then W, column by column; between evaluations zero outside the supports of the rows.
     LargeArray A_;
     // Rows of W's columns, ascending, with all ancestors.
@@ -101,8 +103,6 @@ private:
     // Solves R^T z = Pi^T g: `solved(k, z_k)` for each k in turn.
     template <class Solved>
     void forward(const double* g, Solved solved) const;
-    void times_q(double* x) const;
-    void times_q_transposed(double* x) const;
 
     // The tree: ancestors of coordinate k, the nearest first, at ancestor_start_[k]; L_ at the same
     // places; its diagonal, and the inverse of that.

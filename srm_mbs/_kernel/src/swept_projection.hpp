@@ -12,7 +12,13 @@
 // column in the same row, that of the pivot.  So the column fills no more of the rows that it has
 // in common with the next one than before, and reflections stay as short as the columns.  One
 // reflection over all rows would fill each of them with the columns of all others.
+//
+// The rows and columns that the sweep has met and not closed yet are in a small dense panel, which a
+// processor keeps in its first cache.  When it is full, they move to its front; it grows when they
+// fill it.  Columns come to it in the order of the sweep, and those that remain keep this order.
 #pragma once
+
+#include <type_traits>
 
 #include "sparse_projection.hpp"
 
@@ -27,49 +33,88 @@ public:
     void weak_normals(std::vector<double>& out) const override;
 
 private:
+    // Columns of W in their order, and the coordinates and values of what is left of each: in the
+    // first sweep, all of W.  reach: up to which column all have to be in the panel before each is
+    // reflected, since a reflection of a row changes all of its columns.
+    struct Sweep {
+        std::vector<int> columns, start{0}, coordinates, reach;
+        std::vector<double> values;
+    };
+    // The number of words of the panel, if it is known to the compiler.
+    using One = std::integral_constant<int, 1>;
+
+    void pivoted_qr(double floor) override;
+    void times_q(double* x) const override;
+    void times_q_transposed(double* x) const override;
+    double smallest_pivot() const override;
+    void apply_reflection(int l, double* x) const;
     void sort_pivots() const;
     void normal_of_pivot(int k, double* out) const;
-    void pivoted_qr(double floor) override;
-    double smallest_pivot() const override;
-    void take_columns();
-    double start_sweep();
-    double remaining(int column) const;
-    int take_from_window();
-    void gather(int column);
-    void eliminate(int column, bool forward);
-    void reflect(const int* at, double* v, int n);
-    void reflect_pair(int one, int two, double second, double tau);
-    void reflect_rows(const int* at, const double* v, int n, double tau);
-    // Columns of word w that have an entry in a row from now on.
-    void enter(int row, Word columns, int w) {
-        if (columns & ~columns_of_.words(row)[w]) enter_fresh(row, columns, w);
+    void find_reach(Sweep& sweep) const;
+    void keep_deferred();
+    void resize(int words);
+    void make_room(int entries);
+    void clear_panel();
+    void forget_places();
+    void enter(int coordinate, int c, double value);
+    void take_column(const Sweep& sweep);
+    void fill_window(const Sweep& sweep);
+    int largest_in_window();
+    void sum(int column);
+    template <class Words>
+    bool take_pivots(const Sweep& sweep, double least, Words words);
+    template <class Words>
+    int gather(int column, Words words);
+    template <class Words>
+    void sort(int n, Words words);
+    template <class Words>
+    void eliminate(int column, int n, Words words);
+    template <class Words>
+    void reflect(int first, int n, Words words);
+    template <class Words>
+    void reflect_pair(int one, int two, double p, double q, Words words);
+    void reflect_rows(const int* of, const double* v, int n, double tau);
+    template <class Words>
+    void take_right(int column, int pivot, Words words);
+
+    template <class Words>
+    double* row(int r, Words words) {
+        return panel_.data() + static_cast<std::ptrdiff_t>(r) * words * 64;
     }
-    void enter_fresh(int row, Word columns, int w);
-    void take_right(int column, int pivot);
-    void clear_rows();
-    double* row(int i) { return &values_[static_cast<std::size_t>(i) * rows]; }
-    const double* row(int i) const { return &values_[static_cast<std::size_t>(i) * rows]; }
+    template <class Words>
+    Word* columns_in(int r, Words words) {
+        return columns_in_.data() + static_cast<std::ptrdiff_t>(r) * words;
+    }
+    template <class Words>
+    Word* rows_in(int c, Words words) {
+        return rows_in_.data() + static_cast<std::ptrdiff_t>(c) * words;
+    }
 
     double pivot_share_;
     std::size_t pivot_window_;
-    // Places of the coordinates among the working rows.
-    std::vector<int> row_place_;
-    // Working rows (nv, rows) of the working columns, zero outside their rows.  open_columns_ are
-    // those to come in the sweep.
-    LargeArray values_;
-    // Columns of this sweep, ascending; those deferred to the next one; those in the window.
-    std::vector<int> waiting_, deferred_, window_;
-    // Of each working column: size up to which entries are negligible, squared norm of what is
-    // left, and that norm when it was last summed, in the window.
-    std::vector<double> small_, left_, summed_;
-    // Columns that have lost most of that norm.
-    std::vector<int> lost_;
+    Sweep first_sweep_, later_sweep_;
+
+    // The panel, row by row, with room for 64 words_ rows and columns; zero outside the bit sets, the
+    // columns in each row and the rows in each column.  Rows are those of the coordinates row_at_,
+    // and panel_row_ of a coordinate is its row, or -1.  open_columns_ are no pivots yet, and
+    // coming_ are those of them that are not deferred.
+    int words_ = 0, row_count_ = 0, column_count_ = 0;
+    std::vector<double> panel_;
+    std::vector<int> panel_row_;
+    std::vector<Word> columns_in_, rows_in_, coming_;
+    // Of each column: size up to which entries are negligible, squared norm of what is left, and
+    // below which that has lost its digits.
+    std::vector<double> small_, left_, lost_;
+    std::vector<int> place_;  // to which each column moves
+    // How many columns of the sweep were taken into the panel, and into the window; the window.
+    int taken_ = 0, next_ = 0;
+    std::vector<int> window_;
+    std::vector<double> most_;  // see largest_in_window()
     // Rows of the current column, the last column to come in each, and its entries.
     std::vector<int> touched_, last_;
     std::vector<double> entries_;
+    std::vector<double*> at_;
     mutable std::vector<int> by_pivot_;
-    // rows_of_ and columns_of_ of W.
-    BitSets first_rows_of_, first_columns_of_;
 };
 
 }  // namespace srm

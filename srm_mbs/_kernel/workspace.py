@@ -9,15 +9,22 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import pinocchio as pin
 
 LARGE = 64
 """Coordinates from which the kernel makes the workspaces: Pinocchio's own have 8 MB there."""
 
+KEPT_SYSTEMS = 4
+"""Kernel systems of one mechanism that wait for users, at most; of a large mechanism one."""
 
 Pooled = TypeVar("Pooled")
+
+
+def idle_pool(nv: int) -> deque[Any]:
+    """An empty pool for kernel systems of a mechanism with ``nv`` coordinates."""
+    return deque(maxlen=1 if nv > LARGE else KEPT_SYSTEMS)
 
 
 def take_idle(pool: deque[Pooled]) -> Pooled | None:

@@ -51,7 +51,7 @@ void find_rows(Data& data, const Model& model) {
 
 }  // namespace
 
-void prepare(Data& data, const Model& model) {
+void prepare(Data& data, const Model& model, bool local_crba) {
     if (!model.mimicking_joints.empty()) {
         data = Data(model);
         return;
@@ -83,7 +83,13 @@ void prepare(Data& data, const Model& model) {
                          &data.IS, &data.Ag, &data.dAg, &data.J, &data.dJ, &data.ddJ, &data.psid,
                          &data.psidd, &data.dVdq, &data.dAdq, &data.dAdv})
         matrix->setZero(6, nv);
-    data.Fcrb.assign(count, Data::Matrix6x::Zero(6, nv));
+#ifdef NDEBUG
+    const std::size_t frames = local_crba ? count : 1;
+#else
+    const std::size_t frames = count;  // at which Pinocchio's assertions look
+#endif
+    data.Fcrb.resize(count);
+    for (std::size_t i = 0; i < frames; ++i) data.Fcrb[i].setZero(6, nv);
     data.hg.setZero();
     data.dhg.setZero();
     data.Ig.setZero();

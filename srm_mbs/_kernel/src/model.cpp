@@ -36,7 +36,7 @@ void tree_numbers(const void* from, std::vector<double>& placements, std::vector
 
 PyObject* lean_data(const void* model) {
     const auto data = std::make_shared<pinocchio::Data>();
-    pinocchio_model::prepare(*data, *static_cast<const pinocchio::Model*>(model));
+    pinocchio_model::prepare(*data, *static_cast<const pinocchio::Model*>(model), true);
     return boost::python::incref(boost::python::object(data).ptr());
 }
 

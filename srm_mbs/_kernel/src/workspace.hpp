@@ -16,7 +16,7 @@ struct Workspace {
     explicit Workspace(const pinocchio::Model& model)
         : model(&model), q(model.nq), q2(model.nq), v(model.nv), tau(model.nv),
           one_pass(has_usual_joints(model)) {
-        prepare(data, model);
+        prepare(data, model, false);
     }
     const pinocchio::Model* model;
     pinocchio::Data data;

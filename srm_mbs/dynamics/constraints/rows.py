@@ -36,15 +36,13 @@ from typing import Any, NamedTuple, Self, cast
 import numpy as np
 import pinocchio as pin
 
-from srm_mbs._kernel.workspace import LARGE, workspace
+from srm_mbs._kernel.workspace import idle_pool, workspace
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.copies import copied
 from srm_mbs.model.lazy import cached_property
 
-KEPT_SYSTEMS = 4
-"""Kernel systems of one mechanism that wait for users, at most; of a large mechanism one."""
 Vector = Sequence[float]
 """Three numbers."""
 Triple = tuple[float, float, float]
@@ -480,7 +478,7 @@ class LoopKinematics:
             Elimination(place[row], place[other], factor * size[other] / size[row])
             for row, other, factor in eliminations
         ]
-        self.idle: deque[Any] = deque(maxlen=1 if model.nv > LARGE else KEPT_SYSTEMS)
+        self.idle = idle_pool(model.nv)
         self._allocate()
 
     def __getstate__(self) -> dict[str, Any]:

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._kernel import core
-from srm_mbs._kernel.workspace import LARGE, take_idle
+from srm_mbs._kernel.workspace import idle_pool, take_idle
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.compiled_rows import compiled_rows
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.reactions import Reactions, named_reactions
 from srm_mbs.dynamics.constraints.rheonomic import all_rows, constraint_errors, unscaled_rows
 from srm_mbs.dynamics.constraints.row_algebra import INERT, SingularValues, active_rows
-from srm_mbs.dynamics.constraints.rows import KEPT_SYSTEMS
 from srm_mbs.dynamics.forces import ForceKinematics
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
@@ -60,7 +59,7 @@ def _idle_all_rows(mechanism: Mechanism) -> deque[Any]:
     same = not (mechanism.drives or mechanism.forces) and mechanism.model.nq == mechanism.model.nv
     if known is not None and same:
         return known
-    return deque(maxlen=1 if mechanism.model.nv > LARGE else KEPT_SYSTEMS)
+    return idle_pool(mechanism.model.nv)
 
 
 class _Lent:

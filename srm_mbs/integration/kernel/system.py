@@ -10,9 +10,8 @@ from typing import Any, Self, cast
 import numpy as np
 
 from srm_mbs._kernel import core
-from srm_mbs._kernel.workspace import take_idle
+from srm_mbs._kernel.workspace import idle_pool, take_idle
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.constraints.rows import KEPT_SYSTEMS
 from srm_mbs.dynamics.constraints.structure import rows_in_use, structure_of
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.system import Zone
@@ -22,8 +21,8 @@ from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.integration.singular_endpoints import MakesNodes
 from srm_mbs.model.mechanism import MechanismData, per_model
 
-LARGEST_KEPT = 64
-"""Coordinates of a mechanism that keeps any: one takes 1.7 MB there."""
+LARGEST_KEPT = 641
+"""Coordinates of a mechanism that keeps any: one takes 10 MB there."""
 
 
 def make_kernel_system(system: ClosedSystem | OpenSystem, code: Any = None) -> Any:
@@ -62,7 +61,7 @@ def idle_workspaces(mechanism: MechanismData) -> deque[Any]:
     """The pool of a mechanism: kernel systems of :func:`shared` ones that no run uses; those of
     variants with the same rows and without force elements are the same."""
     if mechanism.forces or not structure_of(mechanism).rank:
-        return deque(maxlen=KEPT_SYSTEMS)
+        return idle_pool(mechanism.model.nv)
     return rows_in_use(mechanism).idle
 
 

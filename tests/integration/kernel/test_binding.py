@@ -12,8 +12,8 @@ import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.multibody import ClosedSystem
-from srm_mbs.integration.kernel.marshalling import FORCE_KINDS
 from srm_mbs.integration.kernel import backend, marshalling
+from srm_mbs.integration.kernel.marshalling import FORCE_KINDS
 from srm_mbs.integration.methods.base import IntegratorState
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from tests.support.bundled import load

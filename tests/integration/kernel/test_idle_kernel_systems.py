@@ -16,7 +16,7 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.dynamics.constraints.rows import KEPT_SYSTEMS
+from srm_mbs._kernel.workspace import KEPT_SYSTEMS
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import ControllerError
 from srm_mbs.integration.kernel import backend as kernel

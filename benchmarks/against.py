@@ -207,14 +207,18 @@ def main() -> None:
                     f"run, {name}, rtol {rtol:g}", other, here, rounds, "run", name, 10.0, rtol, 100
                 )
         if "loops" in arguments.cases:
-            of_kernel = []
+            times: dict[str, list[float]] = {}
             for n in arguments.loops:
-                compare(f"evaluation, {n} loops", other, here, rounds, "mean", n)
-                compare(f"run, {n} loops", other, here, rounds, "run", n, 1.2, 1e-8, 0)
-                title = f"evaluation, {n} loops, without generated code"
-                of_kernel.append(compare(title, other, here, rounds, "mean", n, "kernel"))
-            growth = of_kernel[-1] / of_kernel[0]
-            print(f"growth of the last from {arguments.loops[0]} loops on: {growth:.1f}")
+                for title, case in (
+                    ("evaluation", ("mean", n)),
+                    ("run", ("run", n, 1.2, 1e-8, 0)),
+                    ("evaluation without generated code", ("mean", n, "kernel")),
+                ):
+                    found = compare(f"{n} loops, {title}", other, here, rounds, *case)
+                    times.setdefault(title, []).append(found)
+            first = arguments.loops[0]
+            for title, found in times.items():
+                print(f"growth from {first} loops on, {title}: {found[-1] / found[0]:.1f}")
         other.close()
         here.close()
     if "compile" in arguments.cases:

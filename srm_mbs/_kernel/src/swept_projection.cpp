@@ -79,33 +79,36 @@ void SweptProjection::find_reach(Sweep& sweep) const {
     each_entry([&](int p, int k) { sweep.reach[p] = std::max(sweep.reach[p], last[k]); });
 }
 
-// Makes room for 64 `words` rows and columns in an empty panel.
+// Makes room for 64 `words` rows and columns in an empty panel, which is zero everywhere.
 void SweptProjection::resize(int words) {
     words_ = words;
     const std::size_t places = static_cast<std::size_t>(words) * 64;
-    panel_.assign(places * places, 0.0);
-    for (auto* of : {&columns_in_, &rows_in_}) of->assign(places * words, 0);
+    for (auto* of : {&open_rows_, &open_columns_, &coming_}) of->assign(words, 0);
+    if (small_.size() >= places) return;
+    panel_.resize(places * places);
+    for (auto* of : {&columns_in_, &rows_in_}) of->resize(places * words);
     for (auto* of : {&small_, &left_, &lost_}) of->resize(places);
     for (auto* of : {&row_at_, &column_at_}) of->resize(places);
-    for (auto* of : {&open_rows_, &open_columns_, &coming_}) of->assign(words, 0);
 }
 
-// Empties the panel.
-void SweptProjection::clear_panel() {
+// Empties the panel, and hands its entries to `act`.
+template <class Act>
+void SweptProjection::empty_panel(const Act& act) {
     for (int v = 0; v < words_; ++v)
         each_bit(open_rows_[v], v << 6, [&](int r) {
+            double* const a = row(r, words_);
+            Word* const own = columns_in(r, words_);
             for (int w = 0; w < words_; ++w) {
-                each_bit(columns_in(r, words_)[w], w << 6, [&](int c) { row(r, words_)[c] = 0.0; });
-                columns_in(r, words_)[w] = 0;
+                each_bit(own[w], w << 6, [&](int c) {
+                    act(row_at_[r], c, a[c]);
+                    a[c] = 0.0;
+                });
+                own[w] = 0;
             }
             panel_row_[row_at_[r]] = -1;
         });
-    forget_places();
-}
-
-// Frees all places of rows and columns.
-void SweptProjection::forget_places() {
-    for (auto* of : {&rows_in_, &open_rows_, &open_columns_, &coming_})
+    std::fill_n(rows_in_.begin(), column_count_ * words_, Word{0});
+    for (auto* of : {&open_rows_, &open_columns_, &coming_})
         std::fill(of->begin(), of->end(), Word{0});
     row_count_ = column_count_ = 0;
 }
@@ -113,56 +116,33 @@ void SweptProjection::forget_places() {
 // Moves the open rows and columns to the front of the panel, in the same order, or to a larger one,
 // so that a column with `entries` fits in.
 void SweptProjection::make_room(int entries) {
-    const int old_words = words_;
+    const std::vector<Word> open(open_columns_), coming(coming_);
     int columns = 0, count = 0;
-    int* const place = place_.data();
-    for (int w = 0; w < old_words; ++w) {
-        count += __builtin_popcountll(open_rows_[w]);
-        each_bit(open_columns_[w], w << 6, [&](int c) {
+    for (const Word word : open_rows_) count += __builtin_popcountll(word);
+    for (int w = 0; w < words_; ++w)
+        each_bit(open[w], w << 6, [&](int c) {
             small_[columns] = small_[c];
             left_[columns] = left_[c];
             lost_[columns] = lost_[c];
             column_at_[columns] = column_at_[c];
-            place[c] = columns++;
+            place_[c] = columns++;
         });
-    }
-    for (int& c : window_) c = place[c];
-    const std::vector<Word> open_rows(open_rows_), coming(coming_);
-    std::vector<double> old_panel;
-    std::vector<Word> old_columns_in;
-    double* from = panel_.data();
-    Word* columns_from = columns_in_.data();
+    for (int& c : window_) c = place_[c];
+    moved_.clear();
+    empty_panel([&](int coordinate, int c, double value) {
+        moved_.push_back({coordinate, place_[c], value});
+    });
     int words = words_;
     while (4 * std::max(columns + 1, count + entries) > 3 * 64 * words) words *= 2;
-    if (words > words_) {
-        old_panel.swap(panel_);
-        old_columns_in.swap(columns_in_);
-        from = old_panel.data();
-        columns_from = old_columns_in.data();
-        resize(words);
-    }
-    forget_places();
+    if (words > words_) resize(words);
     column_count_ = columns;
     for (int c = 0; c < columns; ++c) set(open_columns_.data(), c);
-    // Numbers move towards the front, in ascending order: each place is read before it is written.
-    for (int v = 0; v < old_words; ++v) {
-        each_bit(coming[v], v << 6, [&](int c) { set(coming_.data(), place[c]); });
-        each_bit(open_rows[v], v << 6, [&](int r) {
-            double* const a = from + static_cast<std::size_t>(r) * old_words * 64;
-            Word* const own = columns_from + static_cast<std::size_t>(r) * old_words;
-            const int coordinate = row_at_[r];
-            panel_row_[coordinate] = -1;
-            for (int w = 0; w < old_words; ++w) {
-                const Word met = own[w];
-                own[w] = 0;
-                each_bit(met, w << 6, [&](int c) {
-                    const double value = a[c];
-                    a[c] = 0.0;
-                    enter(coordinate, place[c], value);
-                });
-            }
-        });
+    int first = 0;
+    for (const Word word : coming) {
+        each_bit(word, first, [&](int c) { set(coming_.data(), place_[c]); });
+        first += 64;
     }
+    for (const Entry& entry : moved_) enter(entry.coordinate, entry.column, entry.value);
 }
 
 // Writes an entry into the panel.
@@ -284,6 +264,8 @@ inline void SweptProjection::sort(int n, Words words) {
 
 void SweptProjection::pivoted_qr(double floor) {
     reflections_[0] = reflection_start_[0] = right_start_[0] = steps_ = 0;
+    // A regular evaluation needs less room than one before it may have needed.
+    if (words_ > 1) resize(words_ / 2);
     for (std::size_t p = 0; p < first_sweep_.columns.size(); ++p) {
         double* const a = column(first_sweep_.columns[p]);
         for (int s = first_sweep_.start[p]; s < first_sweep_.start[p + 1]; ++s) {
@@ -312,7 +294,7 @@ void SweptProjection::pivoted_qr(double floor) {
     }
     for (int k = 0; k < structural_rank; ++k)
         pivots_[k] = k < steps_ ? std::abs(right_diagonal_[k]) : 0.0;
-    clear_panel();
+    empty_panel([](int, int, double) {});
 }
 
 // The next pivots of a sweep, of squares from `least` on: false if the panel has no longer as many
@@ -361,7 +343,7 @@ void SweptProjection::keep_deferred() {
         later.start.push_back(static_cast<int>(later.values.size()));
     }
     find_reach(later);
-    clear_panel();
+    empty_panel([](int, int, double) {});
 }
 
 // Makes `column`, whose n entries gather() has found, the next pivot.

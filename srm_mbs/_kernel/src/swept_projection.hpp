@@ -13,9 +13,9 @@
 // in common with the next one than before, and reflections stay as short as the columns.  One
 // reflection over all rows would fill each of them with the columns of all others.
 //
-// The rows and columns that the sweep has met and not closed yet are in a small dense panel, which a
-// processor keeps in its first cache.  When it is full, they move to its front; it grows when they
-// fill it.  Columns come to it in the order of the sweep, and those that remain keep this order.
+// The rows and columns that the sweep has met and not closed yet are in a small dense panel, which
+// a processor keeps in its first cache.  When it is full, they move to its front; it grows when
+// they fill it.  Columns come to it in the order of the sweep, and those that remain keep it.
 #pragma once
 
 #include <type_traits>
@@ -40,6 +40,10 @@ private:
         std::vector<int> columns, start{0}, coordinates, reach;
         std::vector<double> values;
     };
+    struct Entry {
+        int coordinate, column;
+        double value;
+    };
     // The number of words of the panel, if it is known to the compiler.
     using One = std::integral_constant<int, 1>;
 
@@ -54,8 +58,8 @@ private:
     void keep_deferred();
     void resize(int words);
     void make_room(int entries);
-    void clear_panel();
-    void forget_places();
+    template <class Act>
+    void empty_panel(const Act& act);
     void enter(int coordinate, int c, double value);
     void take_column(const Sweep& sweep);
     void fill_window(const Sweep& sweep);
@@ -94,8 +98,8 @@ private:
     std::size_t pivot_window_;
     Sweep first_sweep_, later_sweep_;
 
-    // The panel, row by row, with room for 64 words_ rows and columns; zero outside the bit sets, the
-    // columns in each row and the rows in each column.  Rows are those of the coordinates row_at_,
+    // The panel, row by row, with room for 64 words_ rows and columns; zero outside the bit sets,
+    // the columns in each row and the rows in each column.  Rows are of the coordinates row_at_,
     // and panel_row_ of a coordinate is its row, or -1.  open_columns_ are no pivots yet, and
     // coming_ are those of them that are not deferred.
     int words_ = 0, row_count_ = 0, column_count_ = 0;
@@ -105,7 +109,9 @@ private:
     // Of each column: size up to which entries are negligible, squared norm of what is left, and
     // below which that has lost its digits.
     std::vector<double> small_, left_, lost_;
-    std::vector<int> place_;  // to which each column moves
+    // Where each column moves, and the entries that do.
+    std::vector<int> place_;
+    std::vector<Entry> moved_;
     // How many columns of the sweep were taken into the panel, and into the window; the window.
     int taken_ = 0, next_ = 0;
     std::vector<int> window_;

@@ -73,13 +73,10 @@ protected:
     std::vector<int> reflection_row_, right_column_;
     std::vector<double> reflection_, right_;
 
-    // Working rows and columns: the rows and columns of W that they are, bit sets of the rows of
-    // each column and of the columns of each row, and the open ones, which are not done.
+    // Working rows and columns: the rows and columns of W that they are, and the open ones, which
+    // are not done.
     std::vector<int> row_at_, column_at_;
-    BitSets rows_of_, columns_of_;
-    std::vector<Word> open_rows_, open_columns_, changed_;
-    std::vector<double> along_;
-    mutable std::vector<double> scratch_, solved_;
+    std::vector<Word> open_rows_, open_columns_;
 
 private:
     void factorise(const double* M, const double* f, const double* bias, double floor) override;
@@ -108,6 +105,11 @@ private:
     // places; its diagonal, and the inverse of that.
     std::vector<int> ancestor_start_, ancestors_;
     std::vector<double> L_, diagonal_, inverse_;
+    mutable std::vector<double> scratch_, solved_;
+    // Bit sets of the rows of each working column and of the columns of each row.
+    BitSets rows_of_, columns_of_;
+    std::vector<Word> changed_;
+    std::vector<double> along_;
     // The working columns (row_count_, column_count_) are in A_, zero outside their rows: first all
     // of W, after pack() the open ones in the same order.  place_of_ is the inverse of column_at_.
     int row_count_ = 0, column_count_ = 0;

@@ -40,6 +40,7 @@ private:
         std::vector<int> columns, start{0}, coordinates, reach;
         std::vector<double> values;
     };
+    // An entry of the panel that moves, to `column`.
     struct Entry {
         int coordinate, column;
         double value;
@@ -119,7 +120,7 @@ private:
     // Rows of the current column, the last column to come in each, and its entries.
     std::vector<int> touched_, last_;
     std::vector<double> entries_;
-    std::vector<double*> at_;
+    std::vector<double*> at_;  // a word of rows that are reflected
     mutable std::vector<int> by_pivot_;
 };
 

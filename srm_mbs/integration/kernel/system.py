@@ -22,7 +22,7 @@ from srm_mbs.integration.singular_endpoints import MakesNodes
 from srm_mbs.model.mechanism import MechanismData, per_model
 
 LARGEST_KEPT = 641
-"""Coordinates of a mechanism that keeps any: one takes 10 MB there."""
+"""Coordinates of a mechanism that keeps any: one takes 11 MB there."""
 
 
 def make_kernel_system(system: ClosedSystem | OpenSystem, code: Any = None) -> Any:

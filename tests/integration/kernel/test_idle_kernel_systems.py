@@ -16,7 +16,7 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from srm_mbs._kernel.workspace import KEPT_SYSTEMS
+from srm_mbs._kernel.workspace import KEPT_SYSTEMS, LARGE
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import ControllerError
 from srm_mbs.integration.kernel import backend as kernel
@@ -132,7 +132,18 @@ def test_pickles_and_copies_carry_none() -> None:
     assert not idle(copy.copy(mechanism))
 
 
-def test_large_mechanisms_keep_none() -> None:
+def test_a_mechanism_with_many_loops_keeps_one_with_which_runs_are_those_of_a_new_one() -> None:
+    mechanism = srm.n_four_bar(40)
+    assert mechanism.model.nv > LARGE
+    expected = run(srm.n_four_bar(40))
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(lambda _: run(mechanism), range(4)))
+    (kept,) = idle(mechanism)
+    assert np.array_equal(run(mechanism).steps.states, expected.steps.states)
+    assert idle(mechanism) == [kept]
+
+
+def test_the_largest_mechanisms_keep_none() -> None:
     model = pin.Model()
     for i in range(kernel_systems.LARGEST_KEPT + 1):
         model.addJoint(i, pin.JointModelRY(), along_x(0.1), f"j{i}")

@@ -66,18 +66,25 @@ def assembled(model: pin.Model, loops: list[srm.LoopClosure], guess: Any) -> srm
     return mechanism.with_state(start.q, start.v)
 
 
-def islands(lengths: tuple[float, ...]) -> srm.Mechanism:
-    """Four-bars side by side, with couplers of these lengths (m), from crooked positions."""
+def islands(lengths: tuple[float, ...], floating: bool = False) -> srm.Mechanism:
+    """Four-bars side by side, on the ground or on a free body, with couplers of these lengths (m),
+    from crooked positions."""
     model = pin.Model()
     model.name = "islands"
+    base = 0
+    if floating:
+        base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "base")
+        model.appendBodyToJoint(base, rod(1.0, 50.0, 1.0), pin.SE3.Identity())
     loops = []
     for k, length in enumerate(lengths):
-        crank = add_bar(model, 0, 4.0 * k, 0.6, f"crank_{k}")
+        crank = add_bar(model, base, 4.0 * k, 0.6, f"crank_{k}")
         add_bar(model, crank, 0.6, length, f"coupler_{k}")
-        add_bar(model, 0, 4.0 * k + 1.2, 0.8, f"rocker_{k}")
+        add_bar(model, base, 4.0 * k + 1.2, 0.8, f"rocker_{k}")
         ends = (f"coupler_{k}", length), (f"rocker_{k}", 0.8)
         loops.append(between("point", f"loop_{k}", *ends))
-    return assembled(model, loops, np.tile([-1.2, 0.9, -1.9], len(lengths)))
+    guess = pin.neutral(model)
+    guess[-3 * len(lengths) :] = np.tile([-1.2, 0.9, -1.9], len(lengths))
+    return assembled(model, loops, guess)
 
 
 def dense_and_sparse(mechanism: srm.Mechanism) -> tuple[ClosedSystem, Any, Any]:
@@ -171,6 +178,17 @@ def test_its_terms_are_the_dense_ones_up_to_the_singularity_of_a_chain(n: int) -
         x = flat(mechanism, angle)
         found = sparse.terms(0.0, x)
         alike(found, dense.terms(0.0, x), same_pivots=system.nv <= GRAPH_ORDER_ABOVE)
+        alike(found, reference_terms(system, x))
+
+
+def test_its_terms_are_the_dense_ones_where_all_rows_share_the_coordinates_of_one_body() -> None:
+    """All columns meet in its rows, more than 64 of them, which are reflected together."""
+    mechanism = islands(tuple(np.linspace(1.0, 1.3, 40)), floating=True)
+    system, dense, sparse = dense_and_sparse(mechanism)
+    assert system.constants()["order"]
+    for x in states(mechanism, 5):
+        found = sparse.terms(0.0, x)
+        alike(found, dense.terms(0.0, x), same_pivots=False)
         alike(found, reference_terms(system, x))
 
 
@@ -269,7 +287,7 @@ def test_each_island_moves_as_it_does_alone() -> None:
         assert np.abs(together["rate"][6 + 3 * k : 9 + 3 * k] - rate).max() < 1e-11
 
 
-@pytest.mark.parametrize("n", [10, 40])
+@pytest.mark.parametrize("n", [10, 40, 100])
 def test_an_evaluation_leaves_nothing_behind_for_the_next(n: int) -> None:
     mechanism = srm.n_four_bar(n)
     _, _, sparse = dense_and_sparse(mechanism)

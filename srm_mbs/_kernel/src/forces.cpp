@@ -21,19 +21,46 @@ using Vector6 = Eigen::Matrix<double, 6, 1>;
 constexpr double pi = 3.14159265358979323846;
 constexpr double inf = std::numeric_limits<double>::infinity();
 
-SE3 placement(const Anchor& anchor, const pinocchio::Data& data) {
+using pinocchio_model::Workspace;
+
+// Placements in world axes are from the base of the tree of the body.
+SE3 placement(const Anchor& anchor, const Workspace& work) {
     const SE3 inside = pinocchio_model::placement(anchor.placement.data());
-    return anchor.joint ? data.oMi[anchor.joint] * inside : inside;
+    return anchor.joint ? work.data.oMi[anchor.joint] * inside : inside;
 }
 
-Vector3d origin(const Anchor& anchor, const pinocchio::Data& data) {
+Vector3d origin(const Anchor& anchor, const Workspace& work) {
     const Eigen::Map<const Vector3d> inside(anchor.placement.data() + 9);
-    return anchor.joint ? data.oMi[anchor.joint].act(Vector3d(inside)) : Vector3d(inside);
+    return anchor.joint ? work.data.oMi[anchor.joint].act(Vector3d(inside)) : Vector3d(inside);
 }
 
-// Spatial velocity of the body, in world axes at the world origin.
-Motion velocity(const Anchor& anchor, const pinocchio::Data& data) {
-    return anchor.joint ? data.oMi[anchor.joint].act(data.v[anchor.joint]) : Motion::Zero();
+// From b to a of an element.
+Vector3d between(const ForceElement& e, const Vector3d& at_a, const Vector3d& at_b,
+                 const Workspace& work) {
+    return work.between(e.a.joint, at_a, e.b.joint, at_b);
+}
+
+// a as b sees it.
+SE3 relative_placement(const ForceElement& e, const SE3& a, const SE3& b, const Workspace& work) {
+    const Eigen::Matrix3d to_b = b.rotation().transpose();
+    return {to_b * a.rotation(), to_b * between(e, a.translation(), b.translation(), work)};
+}
+
+SE3 relative_placement(const ForceElement& e, const Workspace& work) {
+    return relative_placement(e, placement(e.a, work), placement(e.b, work), work);
+}
+
+// Spatial velocity of the body, in world axes at the base.
+Motion velocity(const Anchor& anchor, const Workspace& work) {
+    return anchor.joint ? work.data.oMi[anchor.joint].act(work.data.v[anchor.joint])
+                        : Motion::Zero();
+}
+
+// That of a against b, at the base of a.
+Motion relative_velocity(const ForceElement& e, const Workspace& work) {
+    Motion b = velocity(e.b, work);
+    b.linear() += b.angular().cross(work.base_apart(e.a.joint, e.b.joint));
+    return velocity(e.a, work) - b;
 }
 
 Vector3d point_velocity(const Motion& body, const Vector3d& point) {
@@ -47,17 +74,20 @@ struct Sums {
     double* on_bodies;
 };
 
-// tau += (J_a - J_b)^T W for a force at `point` and a moment.
-void add_wrench(const ForceElement& e, const pinocchio::Data& data, const Vector3d& force,
+// tau += (J_a - J_b)^T W for a force at `point`, from the base of a, and a moment.
+void add_wrench(const ForceElement& e, const Workspace& work, const Vector3d& force,
                 const Vector3d& moment, const Vector3d& point, const Sums& sums) {
-    Vector6 wrench;
-    wrench << force, moment + point.cross(force);
+    const Vector3d seen_from_b = point + work.base_apart(e.a.joint, e.b.joint);
+    Vector6 on_a, on_b;
+    on_a << force, moment + point.cross(force);
+    on_b << force, moment + seen_from_b.cross(force);
     for (std::size_t k = 0; sums.tau && k < e.columns.size(); ++k)
-        sums.tau[e.columns[k]] += e.signs[k] * data.J.col(e.columns[k]).dot(wrench);
+        sums.tau[e.columns[k]] +=
+            e.signs[k] * work.data.J.col(e.columns[k]).dot(e.signs[k] > 0.0 ? on_a : on_b);
     if (!sums.on_bodies) return;
-    Eigen::Map<Vector6>(sums.on_bodies + 6 * e.a.joint) += wrench;
+    Eigen::Map<Vector6>(sums.on_bodies + 6 * e.a.joint) += on_a;
     if (e.kind != ForceKind::wrench)
-        Eigen::Map<Vector6>(sums.on_bodies + 6 * e.b.joint) -= wrench;
+        Eigen::Map<Vector6>(sums.on_bodies + 6 * e.b.joint) -= on_b;
 }
 
 // Stretch of a spring beyond its rest length, without force up to its slack from there.
@@ -70,10 +100,10 @@ struct SpringDamper {
     Vector3d at_a, at_b, apart, force;
     double length;
 
-    SpringDamper(const ForceElement& e, double coincident, const pinocchio::Data& data)
-        : at_a(origin(e.a, data)),
-          at_b(origin(e.b, data)),
-          apart(at_a - at_b),
+    SpringDamper(const ForceElement& e, double coincident, const Workspace& work)
+        : at_a(origin(e.a, work)),
+          at_b(origin(e.b, work)),
+          apart(between(e, at_a, at_b, work)),
           force(-e.stiffness * apart),
           length(apart.norm()) {
         if (length < coincident * e.rest) throw EvaluationError{Failure::coincident};
@@ -85,9 +115,9 @@ struct SpringDamper {
     }
 
     // Of the point of a against that of b.
-    Vector3d rate(const ForceElement& e, const pinocchio::Data& data) const {
-        return point_velocity(velocity(e.a, data), at_a) -
-               point_velocity(velocity(e.b, data), at_b);
+    Vector3d rate(const ForceElement& e, const Workspace& work) const {
+        return point_velocity(velocity(e.a, work), at_a) -
+               point_velocity(velocity(e.b, work), at_b);
     }
 
     void damp(const ForceElement& e, const Vector3d& rate) {
@@ -98,16 +128,16 @@ struct SpringDamper {
     }
 };
 
-void spring_damper(const ForceElement& e, double coincident, const pinocchio::Data& data,
+void spring_damper(const ForceElement& e, double coincident, const Workspace& work,
                    const Sums& sums, ForceLaws* laws, int law) {
-    SpringDamper found(e, coincident, data);
-    if (e.damping != 0.0) found.damp(e, found.rate(e, data));
+    SpringDamper found(e, coincident, work);
+    if (e.damping != 0.0) found.damp(e, found.rate(e, work));
     if (laws && law >= 0) {
         const Vector3d line = found.apart / (found.length != 0.0 ? found.length : 1.0);
         const double own = found.force.dot(line), acting = laws->acting(law, own);
         if (acting != own) found.force = acting * line;
     }
-    add_wrench(e, data, found.force, Vector3d::Zero(), found.at_a, sums);
+    add_wrench(e, work, found.force, Vector3d::Zero(), found.at_a, sums);
 }
 
 // Number k of an element whose numbers may follow laws.
@@ -149,15 +179,15 @@ void coupling_spring(const ForceElement& e, const double* q, const double* v, do
     for (std::size_t k = 0; k < e.columns.size(); ++k) tau[e.columns[k]] += e.signs[k] * force;
 }
 
-void wrench(const ForceElement& e, double t, const pinocchio::Data& data, const Sums& sums) {
-    const SE3 at = placement(e.a, data);
+void wrench(const ForceElement& e, double t, const Workspace& work, const Sums& sums) {
+    const SE3 at = placement(e.a, work);
     Vector3d force(over_time(e, 0, t), over_time(e, 1, t), over_time(e, 2, t));
     Vector3d moment(over_time(e, 3, t), over_time(e, 4, t), over_time(e, 5, t));
     if (e.in_link_axes) {
         force = at.rotation() * force;
         moment = at.rotation() * moment;
     }
-    add_wrench(e, data, force, moment, at.translation(), sums);
+    add_wrench(e, work, force, moment, at.translation(), sums);
 }
 
 // The rotation vector of the same rotation about the opposite axis.
@@ -167,14 +197,14 @@ Vector3d other_way(const Vector3d& turn) {
 }
 
 // Rotation vector of a's axes relative to b's, up to half a turn.
-Vector3d rotation_vector(const ForceElement& e, const pinocchio::Data& data) {
-    return pinocchio::log3(placement(e.b, data).actInv(placement(e.a, data)).rotation());
+Vector3d rotation_vector(const ForceElement& e, const Workspace& work) {
+    return pinocchio::log3(relative_placement(e, work).rotation());
 }
 
-void bushing(const ForceElement& e, const pinocchio::Data& data, BushingStep* step,
+void bushing(const ForceElement& e, const Workspace& work, BushingStep* step,
              const Sums& sums, ForceLaws* laws, std::size_t number) {
-    const SE3 Ta = placement(e.a, data), Tb = placement(e.b, data);
-    const SE3 relative = Tb.actInv(Ta);
+    const SE3 Ta = placement(e.a, work), Tb = placement(e.b, work);
+    const SE3 relative = relative_placement(e, Ta, Tb, work);
     Vector3d turn = pinocchio::log3(relative.rotation());
     // dphi/dt is Jlog3 w for w in a's axes, and L^T w in b's: Jlog3 R^T = Jlog3^T.
     Eigen::Matrix3d L;
@@ -188,7 +218,7 @@ void bushing(const ForceElement& e, const pinocchio::Data& data, BushingStep* st
     const Eigen::Map<const Vector3d> d_shift(&e.numbers[6]), d_turn(&e.numbers[9]);
     if (!d_shift.isZero(0.0) || !d_turn.isZero(0.0)) {
         // b's axes and origin move along: what is left is the motion seen from b.
-        const Motion W = velocity(e.a, data) - velocity(e.b, data);
+        const Motion W = relative_velocity(e, work);
         const Vector3d rate =
             Tb.rotation().transpose() * point_velocity(W, Ta.translation());
         const Vector3d spin = L.transpose() * (Tb.rotation().transpose() * W.angular());
@@ -202,7 +232,7 @@ void bushing(const ForceElement& e, const pinocchio::Data& data, BushingStep* st
     }
     const Vector3d world_force = Tb.rotation() * force;
     const Vector3d world_moment = Tb.rotation() * (L * moment);
-    add_wrench(e, data, -world_force, -world_moment, Ta.translation(), sums);
+    add_wrench(e, work, -world_force, -world_moment, Ta.translation(), sums);
 }
 
 // The integral of k d S(d / depth).
@@ -214,8 +244,8 @@ double limit_spring_energy(const ForceElement& e, double position) {
     return e.stiffness * (inside + 0.5 * std::max(beyond * beyond - depth * depth, 0.0));
 }
 
-double bushing_energy(const ForceElement& e, const pinocchio::Data& data) {
-    const SE3 relative = placement(e.b, data).actInv(placement(e.a, data));
+double bushing_energy(const ForceElement& e, const Workspace& work) {
+    const SE3 relative = relative_placement(e, work);
     const Vector3d shift = relative.translation(), turn = pinocchio::log3(relative.rotation());
     double out = 0.0;
     for (int i = 0; i < 3; ++i)
@@ -233,16 +263,17 @@ double linear_energy(double stiffness, double stretch) {
     return 0.5 * stiffness * stretch * stretch;
 }
 
-double energy(const ForceElement& e, const pinocchio::Data& data, const double* q) {
+double energy(const ForceElement& e, const Workspace& work, const double* q) {
     switch (e.kind) {
         case ForceKind::spring_damper:
             return linear_energy(
                 e.stiffness,
-                stretched(e, (origin(e.a, data) - origin(e.b, data)).norm() - e.rest));
+                stretched(e, between(e, origin(e.a, work), origin(e.b, work), work).norm() -
+                                 e.rest));
         case ForceKind::torsion_spring:
             return linear_energy(e.stiffness, q[e.in_q] - e.rest);
         case ForceKind::bushing:
-            return bushing_energy(e, data);
+            return bushing_energy(e, work);
         case ForceKind::limit_spring:
             return limit_spring_energy(e, q[e.in_q]);
         case ForceKind::coupling_spring:
@@ -310,9 +341,9 @@ bool turns(const ForceElement& e) {
 }
 
 BushingStep::BushingStep(const ForceElement& element, const std::vector<double>& limits,
-                         const pinocchio_model::Workspace& work, double t)
+                         const Workspace& work, double t)
     : element_(&element), rounding_(limits[0]), located_(limits[1]) {
-    Vector3d turn = rotation_vector(element, work.data);
+    Vector3d turn = rotation_vector(element, work);
     // At half a turn, the one that gets smaller; a step that ends there measured the same, but for
     // rounding.
     if (past_half_turn(work, t, turn.data(), 2.0) == 0.0) turn = other_way(turn);
@@ -329,25 +360,25 @@ bool BushingStep::nearest(double* turn) {
     return true;
 }
 
-double BushingStep::past_half_turn(const pinocchio_model::Workspace& work, double t) {
+double BushingStep::past_half_turn(const Workspace& work, double t) {
     const bool passed = passed_;
-    Vector3d turn = rotation_vector(*element_, work.data);
+    Vector3d turn = rotation_vector(*element_, work);
     nearest(turn.data());
     const double late = past_half_turn(work, t, turn.data(), 1.0);
     return passed && late == -inf ? inf : late;
 }
 
 // By the rate of the angle; 0 within so many `roundings`.
-double BushingStep::past_half_turn(const pinocchio_model::Workspace& work, double t,
+double BushingStep::past_half_turn(const Workspace& work, double t,
                                    const double* vector, double roundings) const {
     const Eigen::Map<const Vector3d> turn(vector);
     const double angle = turn.norm();
     if (angle < 0.5 * pi) return -inf;
     const Vector3d spin =
-        velocity(element_->a, work.data).angular() - velocity(element_->b, work.data).angular();
+        velocity(element_->a, work).angular() - velocity(element_->b, work).angular();
     const double beyond = angle - pi;
     const double speed =
-        turn.dot(placement(element_->b, work.data).rotation().transpose() * spin) / angle;
+        turn.dot(placement(element_->b, work).rotation().transpose() * spin) / angle;
     if (!(speed > 0.0)) return std::copysign(inf, beyond - rounding_);
     const double spacing = std::nextafter(std::abs(t), inf) - std::abs(t);
     const double slack = roundings * (rounding_ + speed * 4.0 * spacing);
@@ -379,7 +410,7 @@ void ForceLaws::resolve(const std::vector<ForceElement>& elements,
 }
 
 void add_forces(const std::vector<ForceElement>& elements, double coincident,
-                const pinocchio_model::Workspace& work, double t, const double* q,
+                const Workspace& work, double t, const double* q,
                 const double* v, std::vector<BushingStep>& step, double* tau, ForceLaws* laws,
                 double* on_bodies) {
     auto next = step.begin();
@@ -392,7 +423,7 @@ void add_forces(const std::vector<ForceElement>& elements, double coincident,
         const ForceElement& e = elements[number];
         switch (e.kind) {
             case ForceKind::spring_damper:
-                spring_damper(e, coincident, work.data, sums, laws,
+                spring_damper(e, coincident, work, sums, laws,
                               laws ? laws->of_element(number, 0) : -1);
                 break;
             case ForceKind::joint_torque:
@@ -403,10 +434,10 @@ void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 on_joint(e, torsion_spring(e, q[e.in_q], v[e.in_v]));
                 break;
             case ForceKind::wrench:
-                wrench(e, t, work.data, sums);
+                wrench(e, t, work, sums);
                 break;
             case ForceKind::bushing:
-                bushing(e, work.data, turns(e) && next != step.end() ? &*next++ : nullptr, sums,
+                bushing(e, work, turns(e) && next != step.end() ? &*next++ : nullptr, sums,
                         laws, number);
                 break;
             case ForceKind::limit_spring:
@@ -420,13 +451,13 @@ void add_forces(const std::vector<ForceElement>& elements, double coincident,
 }
 
 void add_bushings(const std::vector<ForceElement>& elements,
-                  const pinocchio_model::Workspace& work, std::vector<BushingStep>& step,
+                  const Workspace& work, std::vector<BushingStep>& step,
                   double* tau, ForceLaws* laws) {
     auto next = step.begin();
     for (std::size_t number = 0; number < elements.size(); ++number) {
         const ForceElement& e = elements[number];
         if (e.kind == ForceKind::bushing)
-            bushing(e, work.data, turns(e) && next != step.end() ? &*next++ : nullptr,
+            bushing(e, work, turns(e) && next != step.end() ? &*next++ : nullptr,
                     Sums{tau, nullptr}, laws, number);
     }
 }
@@ -454,12 +485,12 @@ std::array<double, 2> log_coefficient(double square) {
 }  // namespace
 
 void bushing_turns(const std::vector<ForceElement>& elements,
-                   const pinocchio_model::Workspace& work, std::vector<BushingStep>& step,
+                   const Workspace& work, std::vector<BushingStep>& step,
                    double* out) {
     auto next = step.begin();
     for (const ForceElement& e : elements) {
         if (e.kind != ForceKind::bushing) continue;
-        Vector3d turn = rotation_vector(e, work.data);
+        Vector3d turn = rotation_vector(e, work);
         if (turns(e) && next != step.end()) (next++)->nearest(turn.data());
         std::copy_n(turn.data(), 3, out);
         const auto coefficient = log_coefficient(turn.squaredNorm());
@@ -469,10 +500,10 @@ void bushing_turns(const std::vector<ForceElement>& elements,
 }
 
 double spring_damper_power(const ForceElement& e, double coincident,
-                           const pinocchio_model::Workspace& work) {
+                           const Workspace& work) {
     if (e.stiffness == 0.0) {  // a damper alone: its force is along the line that joins the points
         const pinocchio::Data& data = work.data;
-        const Vector3d at_a = origin(e.a, data), at_b = origin(e.b, data), apart = at_a - at_b;
+        const Vector3d apart = between(e, origin(e.a, work), origin(e.b, work), work);
         const double square = apart.squaredNorm(), closest = coincident * e.rest;
         if (square < closest * closest) throw EvaluationError{Failure::coincident};
         Vector3d rate = Vector3d::Zero();
@@ -487,16 +518,16 @@ double spring_damper_power(const ForceElement& e, double coincident,
         const double along = apart.dot(rate);
         return -e.damping * (square != 0.0 ? along * along / square : rate.squaredNorm());
     }
-    SpringDamper found(e, coincident, work.data);
-    const Vector3d rate = found.rate(e, work.data);
+    SpringDamper found(e, coincident, work);
+    const Vector3d rate = found.rate(e, work);
     if (e.damping != 0.0) found.damp(e, rate);
     return found.force.dot(rate);
 }
 
 double potential_energy(const std::vector<ForceElement>& elements,
-                        const pinocchio_model::Workspace& work, const double* q) {
+                        const Workspace& work, const double* q) {
     double out = 0.0;
-    for (const ForceElement& e : elements) out += energy(e, work.data, q);
+    for (const ForceElement& e : elements) out += energy(e, work, q);
     return out;
 }
 

@@ -138,7 +138,7 @@ private:
 // velocities and the world Jacobian there.  With `laws`, their values are found, and of the forces
 // along coordinates the rest is added only if none are applied.  `step`: the bushings that have a
 // moment in the step of the stage, in their order, or none.  The wrenches of elements between links,
-// about the origin of the world, are also added to `on_bodies` (njoints, 6) unless it is null; they
+// about the bases of their trees, are also added to `on_bodies` (njoints, 6) unless it is null; they
 // need no tau.  Throws EvaluationError.
 void add_forces(const std::vector<ForceElement>& elements, double coincident,
                 const pinocchio_model::Workspace& work, double t, const double* q,

@@ -44,7 +44,10 @@ void System::rows_and_mass(const double* q, double* G) {
 
 const double* System::mass_matrix() const { return work_->data.M.data(); }
 
-const double* System::world_jacobian() const { return work_->data.J.data(); }
+std::vector<double> System::world_jacobian() const {
+    const auto J = work_->world_jacobian();
+    return {J.data(), J.data() + J.size()};
+}
 
 void ScaledRows::check() const {
     expect_size("others", others.size(), eliminated.size());
@@ -218,13 +221,13 @@ void ScaledSampler::open_norms(const std::vector<double>& q, std::size_t n, cons
         factorise(there.data());
         const auto& found = all_.projection().row_squares();
         for (std::size_t row = 0; row < found.size(); ++row) squares[row] += found[row];
-        const double* const J = system_.world_jacobian();
+        const std::vector<double> J = system_.world_jacobian();
         for (std::size_t tree = 0; tree + 1 < rows_.trees.size(); ++tree) {
             const int begin = rows_.trees[tree], end = rows_.trees[tree + 1];
             const Matrix inverse = factors_of(system_.mass_matrix(), nv, begin, end)
                                        .solve(Matrix::Identity(end - begin, end - begin));
             for (int j = begin; j < end; ++j) {
-                const double* const column = J + 6 * static_cast<std::size_t>(j);
+                const double* const column = &J[6 * static_cast<std::size_t>(j)];
                 const double turn = norm(column + 3, 3);
                 const double shift = norm(column, 3) + rows_.length * turn;
                 const double mobility = inverse(j - begin, j - begin);

@@ -26,7 +26,7 @@ void sort_unique(std::vector<int>& list) {
 }  // namespace
 
 SeparateElements System::separate(const std::vector<ForceElement>& elements) const {
-    const auto& model = *work_->model;
+    const auto& model = work_->model;
     SeparateElements out;
     for (const ForceElement& e : elements) {
         check_indices(e, nq, nv, model.njoints);
@@ -56,7 +56,7 @@ void System::powers(const double* t, const double* states, std::size_t n,
     auto& w = *work_;
     std::vector<BushingStep> none;
     const bool bodies = !elements.joints.empty();
-    std::vector<double> wrenches(6 * w.model->njoints);
+    std::vector<double> wrenches(6 * w.model.njoints);
     const auto power_on = [&](int joint) {
         const pinocchio::Motion motion = w.data.oMi[joint].act(w.data.v[joint]);
         return dot(&wrenches[6 * joint], motion.toVector().data(), 6);
@@ -68,7 +68,7 @@ void System::powers(const double* t, const double* states, std::size_t n,
         else std::copy(v, v + nv, w.v.data());
         // Bodies that move tell the power of a wrench, which takes no Jacobian.
         if (bodies) pinocchio_model::move_bodies(w, resting ? nullptr : &elements.joints);
-        if (bodies && resting) pinocchio::computeJointJacobians(*w.model, w.data);
+        if (bodies && resting) pinocchio::computeJointJacobians(w.model, w.data);
         for (const std::vector<ForceElement>& one : elements.each) {
             const ForceElement& e = one.front();
             if (!resting && e.kind == ForceKind::spring_damper) {

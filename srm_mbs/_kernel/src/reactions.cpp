@@ -17,7 +17,7 @@ namespace {
 
 using pinocchio_model::Argument;
 
-// A frame of a closure: axes and origin of its body, and its own origin, in the world.
+// A frame of a closure: the axes of its body, and its origin from the base of its tree.
 struct Side {
     Side(const pinocchio::Data& data, int joint, const Point& inside)
         : rotation(data.oMi[joint].rotation().data()),
@@ -32,10 +32,13 @@ void put(const Vec& force, const Vec& moment, double* out) {
 }
 
 // The wrench (6,) on b at b's origin for the multipliers of unscaled rows.
-void wrench_on_b(const ClosureRows& closure, const pinocchio::Data& data, const double* lam,
-                 double* out) {
-    const Side a(data, closure.joint_a, closure.at_a), b(data, closure.joint_b, closure.at_b);
-    const Vec gap = a.at - b.at;
+void wrench_on_b(const ClosureRows& closure, const pinocchio_model::Workspace& work,
+                 const double* lam, double* out) {
+    const Side a(work.data, closure.joint_a, closure.at_a);
+    const Side b(work.data, closure.joint_b, closure.at_b);
+    const Vec gap = vec(work.between(closure.joint_a, Eigen::Vector3d(&a.at.x), closure.joint_b,
+                                     Eigen::Vector3d(&b.at.x))
+                            .data());
     const double* own = lam + closure.first_row;
     Vec force{}, moment{};
     for (std::size_t k = 0; k < closure.directions.size(); k += 3)
@@ -52,7 +55,7 @@ void wrench_on_b(const ClosureRows& closure, const pinocchio::Data& data, const 
 
 }  // namespace
 
-int System::joint_count() const { return work_->model->njoints; }
+int System::joint_count() const { return work_->model.njoints; }
 
 // The least-norm solution of W lam = L^T yhat, W = L^-1 G^T with the rows scaled, down to the rank of
 // the stage: with W Pi = Q R and R^T = Z S, lam = Pi Z S^-T Q^T L^T yhat.
@@ -103,7 +106,7 @@ void System::reactions(double t, const double* state, System& all, const double*
                        const std::vector<int>& kept, double* multipliers, double* on_b,
                        double* joints) {
     auto& w = *work_;
-    const int rows = all.data_.rows, count = w.model->njoints;
+    const int rows = all.data_.rows, count = w.model.njoints;
     std::vector<double> rate(2 * nv), generalised(nv);
     this->rate(rate.data());
     std::fill(multipliers, multipliers + rows, 0.0);
@@ -121,7 +124,7 @@ void System::reactions(double t, const double* state, System& all, const double*
     std::copy(q, q + nq, w.q.data());
     std::copy(v, v + nv, w.v.data());
     std::copy(rate.begin() + nv, rate.end(), w.tau.data());
-    pinocchio::rnea(*w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
+    pinocchio::rnea(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
     for (int j = 0; j < count; ++j) {
         const auto& force = w.data.f[j].toVector();
         std::copy(force.data(), force.data() + 6, joints + 6 * j);
@@ -130,7 +133,7 @@ void System::reactions(double t, const double* state, System& all, const double*
     std::vector<double> loads(6 * static_cast<std::size_t>(count), 0.0);
     if (on_several_) {
         std::vector<BushingStep> none;
-        pinocchio::computeJointJacobians(*w.model, w.data);
+        pinocchio::computeJointJacobians(w.model, w.data);
         add_forces(data_.forces, data_.coincident, w, t, q, v, none, generalised.data(), nullptr,
                    loads.data());
     }
@@ -139,15 +142,18 @@ void System::reactions(double t, const double* state, System& all, const double*
         for (int i = 0; i < 6; ++i) loads[6 * joint + i] += sign * values[i];
     };
     for (const ClosureRows& closure : all.data_.closures) {
-        wrench_on_b(closure, w.data, multipliers, on_b);
+        wrench_on_b(closure, w, multipliers, on_b);
         const Vec force = vec(on_b), at = Side(w.data, closure.joint_b, closure.at_b).at;
-        const Vec moment = vec(on_b + 3) + cross(at, force);
-        add(closure.joint_b, 1.0, force, moment);
-        add(closure.joint_a, -1.0, force, moment);
+        const Vec seen = at + vec(w.base_apart(closure.joint_b, closure.joint_a).data());
+        add(closure.joint_b, 1.0, force, vec(on_b + 3) + cross(at, force));
+        add(closure.joint_a, -1.0, force, vec(on_b + 3) + cross(seen, force));
         on_b += 6;
     }
-    for (int j = count - 1; j > 0; --j)
-        for (int i = 0; i < 6; ++i) loads[6 * w.model->parents[j] + i] += loads[6 * j + i];
+    for (int j = count - 1; j > 0; --j) {
+        const int parent = static_cast<int>(w.model.parents[j]);
+        const Vec force = vec(&loads[6 * j]), apart = vec(w.base_apart(j, parent).data());
+        add(parent, 1.0, force, vec(&loads[6 * j + 3]) + cross(apart, force));
+    }
     for (int j = 0; j < count; ++j) {
         double* const out = joints + 6 * j;
         const double* const carried = &loads[6 * j];

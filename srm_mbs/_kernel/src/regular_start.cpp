@@ -15,8 +15,8 @@ namespace srm {
 
 // Bounding box of joints, centres of mass and anchors: _diagonal() of dynamics/scaling.py.
 double System::scene_diagonal(double rounding) const {
-    const auto& model = *work_->model;
-    const auto& places = work_->data.oMi;
+    const auto& model = work_->model;
+    const auto& work = *work_;
     Eigen::Array3d least = Eigen::Array3d::Constant(std::numeric_limits<double>::infinity());
     Eigen::Array3d most = -least;
     double gyration = 0.0;
@@ -26,14 +26,14 @@ double System::scene_diagonal(double rounding) const {
     };
     for (int i = 0; i < model.njoints; ++i) {
         const auto& body = model.inertias[i];
-        if (i) mark(places[i].translation());
+        if (i) mark(work.in_world(i, Eigen::Vector3d::Zero()));
         if (!(body.mass() > 0.0)) continue;
-        if (i) mark(places[i].act(body.lever()));
+        if (i) mark(work.in_world(i, body.lever()));
         gyration = std::max(gyration, body.inertia().matrix().trace() / body.mass());
     }
     for (const ClosureRows& closure : data_.closures) {
-        mark(places[closure.joint_a].act(Eigen::Vector3d(closure.at_a.data())));
-        mark(places[closure.joint_b].act(Eigen::Vector3d(closure.at_b.data())));
+        mark(work.in_world(closure.joint_a, Eigen::Vector3d(closure.at_a.data())));
+        mark(work.in_world(closure.joint_b, Eigen::Vector3d(closure.at_b.data())));
     }
     if (!(least <= most).all()) return 0.0;
     const double farthest = std::max(least.abs().maxCoeff(), most.abs().maxCoeff());
@@ -43,7 +43,7 @@ double System::scene_diagonal(double rounding) const {
 
 Gyrations System::gyrations(double diagonal) const {
     const double infinite = std::numeric_limits<double>::infinity();
-    const auto& model = *work_->model;
+    const auto& model = work_->model;
     std::vector<double> sizes(model.njoints);
     const auto reach = [&](int joint, const auto& at) {
         sizes[joint] = std::max(sizes[joint], at.norm());
@@ -168,10 +168,10 @@ public:
             system_.retract(state_.data(), delta_.data(), there.data());
             evaluate(there);
             squares += in_units().rowwise().squaredNorm() / n;
-            const double* J = system_.world_jacobian();
-            for (int j = 0; j < nv_; ++j, J += 6) {
-                const double turn = norm(J + 3, 3) * unit_[j];
-                const double shift = norm(J, 3) * unit_[j] / length_ + turn;
+            const std::vector<double> J = system_.world_jacobian();
+            for (int j = 0; j < nv_; ++j) {
+                const double turn = norm(&J[6 * j + 3], 3) * unit_[j];
+                const double shift = norm(&J[6 * j], 3) * unit_[j] / length_ + turn;
                 along += shift * shift / n;
                 turning += turn * turn / n;
             }

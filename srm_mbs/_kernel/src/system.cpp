@@ -28,8 +28,8 @@ constexpr double friction_part = 0.01;  // FRICTION_PART of dynamics/multibody.p
 constexpr int one_pass_size = 12;
 constexpr double two_pi = 6.283185307179586;
 
-// The placement of a joint in the world; its velocity and bias acceleration (with -gravity), in its
-// own axes.
+// The placement of a joint, from the base of its tree; its velocity and bias acceleration (with
+// -gravity), in its own axes.
 struct Body {
     Body(const pinocchio::Data& data, int joint)
         : rotation(data.oMi[joint].rotation().data()),
@@ -219,16 +219,16 @@ System::System(const void* model, SystemData data, Controller controller)
       controller_(std::move(controller)),
       work_(std::make_unique<pinocchio_model::Workspace>(
           checked_model(*static_cast<const pinocchio::Model*>(model)))) {
-    check_indices(data_, *work_->model);
-    nq = work_->model->nq;
-    nv = work_->model->nv;
+    check_indices(data_, work_->model);
+    nq = work_->model.nq;
+    nv = work_->model.nv;
     closed_ = data_.structural_rank > 0;
     flat_ = nq == nv;
     on_several_ = std::any_of(data_.forces.begin(), data_.forces.end(), acts_on_several);
     if (closed_)
         projection_ = make_projection(data_.structural_rank, data_.sigma_ref, pattern(),
                                       // A joint that mimics another adds entries off the tree.
-                                      work_->model->mimicking_joints.empty() ? data_.algebra
+                                      work_->model.mimicking_joints.empty() ? data_.algebra
                                                                             : "dense");
     else
         G_.resize(static_cast<std::size_t>(data_.rows) * nv);
@@ -341,21 +341,24 @@ void System::update_powers(const JointRow& joints, const double* q, bool with_bi
         out[joints.in_v[k]] -= slope * joints.arguments[k];
 }
 
-// A row of G = (force, moment) J.
-void System::fill(const ClosureRows& closure, int row, const Vec& force, const Vec& moment) {
+// A row of G = (force, moment) J, with the moment on a about its base, that on b about its own.
+void System::fill(const ClosureRows& closure, int row, const Vec& force, const Vec& on_a,
+                  const Vec& on_b) {
     const double* J = work_->data.J.data();
     double* const out = column(row);
     for (std::size_t k = 0; k < closure.columns.size(); ++k) {
         const int j = closure.columns[k];
         const double* column = J + 6 * j;
+        const Vec& moment = closure.signs[k] > 0.0 ? on_a : on_b;
         out[j] = closure.signs[k] * (dot(force, vec(column)) + dot(moment, vec(column + 3)));
     }
 }
 
 // Rows along directions and distances of points.
 //
-// x is the point of anchor a in the world, p its offset from the point of anchor b in the axes of
-// b, r and bias the first derivative of p and the second without accelerations of the joints.
+// x is the point of anchor a from its base, seen from that of b, p its offset from the point of
+// anchor b in the axes of b, r and bias the first derivative of p and the second without
+// accelerations of the joints.
 // With `rates` (rows,), G v is written there, from the velocities of the bodies, and neither G nor
 // Gdot v is computed.
 void System::update_positions(const ClosureRows& closure, bool with_bias, double* rates) {
@@ -363,7 +366,9 @@ void System::update_positions(const ClosureRows& closure, bool with_bias, double
     const bool ground = closure.joint_b == 0;
     const Vec at_a = vec(closure.at_a.data());
     const Vec x = to_world(a.rotation, at_a) + a.origin();
-    const Vec at_b = ground ? x : from_world(b.rotation, x - b.origin());
+    const Vec base_a = vec(work_->base(closure.joint_a).data());
+    const Vec seen_x = x + (base_a - vec(work_->base(closure.joint_b).data()));
+    const Vec at_b = ground ? x : from_world(b.rotation, seen_x - b.origin());
     Vec r{}, bias{};
     if (rates) {
         r = to_world(a.rotation, a.velocity() + cross(a.spin(), at_a));
@@ -386,7 +391,8 @@ void System::update_positions(const ClosureRows& closure, bool with_bias, double
                    (b.bias() + cross(b.spin_bias(), at_b) + cross(b.spin(), twice));
         }
     }
-    const Vec p = at_b - vec(closure.at_b.data());
+    const Vec anchor_b = vec(closure.at_b.data());
+    const Vec p = at_b - (ground ? anchor_b - base_a : anchor_b);
     int row = closure.first_row;
     const auto along = [&](const Vec& d, double g, double rate) {
         g_[row] = g;
@@ -395,7 +401,7 @@ void System::update_positions(const ClosureRows& closure, bool with_bias, double
             return;
         }
         const Vec e = ground ? d : to_world(b.rotation, d);
-        fill(closure, row, e, cross(x, e));
+        fill(closure, row, e, cross(x, e), cross(seen_x, e));
         if (with_bias) bias_[row] = rate;
         ++row;
     };
@@ -437,7 +443,8 @@ void System::update_alignments(const ClosureRows& closure, bool with_bias, doubl
             rates[row] = dot(n, cross(w, m));
             continue;
         }
-        fill(closure, row, Vec{}, to_world(b.rotation, cross(m, n)));
+        const Vec moment = to_world(b.rotation, cross(m, n));
+        fill(closure, row, Vec{}, moment, moment);
         if (with_bias) bias_[row] = dot(n, cross(bias, m) + cross(w, cross(w, m)));
     }
 }
@@ -453,10 +460,10 @@ void System::hold(double t, const double* force, bool keep) {
 
 void System::move(const void* model, const std::vector<Point>& origins) {
     const auto& other = checked_model(*static_cast<const pinocchio::Model*>(model));
-    if (other.njoints != work_->model->njoints || other.nq != nq || other.nv != nv)
+    if (other.njoints != work_->model.njoints || other.nq != nq || other.nv != nv)
         throw std::invalid_argument("model has other joints");
     expect_size("origins", origins.size(), 2 * data_.closures.size());
-    work_->model = &other;
+    work_->take(other);
     auto next = origins.begin();
     for (ClosureRows& closure : data_.closures) {
         closure.at_a = *next++;
@@ -550,10 +557,10 @@ void System::law_accelerations(double* out) {
     };
     if (code_) {  // it computes the kinematics of bushings only
         pinocchio_model::move_bodies(w);
-        pinocchio::computeJointJacobians(*w.model, w.data);
+        pinocchio::computeJointJacobians(w.model, w.data);
     }
     if (!closed_ && nv > one_pass_size) {
-        pinocchio::crba(*w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
+        pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
         factorise_mass();
     }
     if (joined_.empty()) forces_with(none);
@@ -746,7 +753,7 @@ void System::tree_terms(const double* state) {
     else if (closed_)
         pinocchio_model::compute_terms(w);
     else
-        pinocchio::aba(*w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
+        pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
 }
 
 // The velocities, and the forces along coordinates but those of elements.
@@ -775,7 +782,7 @@ void System::applied_forces(double t, const double* state, double* out) {
     if (!data_.forces.empty()) {
         if (on_several_) {
             move_bodies(state);
-            pinocchio::computeJointJacobians(*w.model, w.data);
+            pinocchio::computeJointJacobians(w.model, w.data);
         }
         add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
                    tracks_laws_ ? &laws_ : nullptr);
@@ -792,7 +799,7 @@ bool System::derivatives(const double* state, const double* a, double* by_forces
     const auto powers = [](const JointRow& row) { return !row.powers.empty(); };
     if (!data_.closures.empty() || !joined_.empty() || rank_deficient()) return false;
     if (std::any_of(data_.joint_rows.begin(), data_.joint_rows.end(), powers)) return false;
-    if (!w.model->mimicking_joints.empty() || !w.model->gravity.angular().isZero(0.0)) return false;
+    if (!w.model.mimicking_joints.empty() || !w.model.gravity.angular().isZero(0.0)) return false;
     Matrix M = Matrix::Zero(nv, nv), dq(M), dv(M), N;
     if (closed_) {
         N.resize(nv, rank());
@@ -801,7 +808,7 @@ bool System::derivatives(const double* state, const double* a, double* by_forces
     std::copy(state, state + nq, w.q.data());
     std::copy(state + nq, state + nq + nv, w.v.data());
     std::copy(a, a + nv, w.tau.data());
-    pinocchio::computeRNEADerivatives(*w.model, w.data, Argument(w.q), Argument(w.v),
+    pinocchio::computeRNEADerivatives(w.model, w.data, Argument(w.q), Argument(w.v),
                                       Argument(w.tau), Eigen::Ref<Matrix>(dq),
                                       Eigen::Ref<Matrix>(dv), Eigen::Ref<Matrix>(M));
     const Eigen::LLT<Matrix, Eigen::Upper> factors(M);
@@ -882,7 +889,7 @@ bool System::linearise(double t, const double* state, const double* a,
         white_ = projection_->white_multiplier;
         projection_->multiplier(white_.data(), multipliers_.data());
     } else if (nv > one_pass_size) {
-        pinocchio::crba(*w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
+        pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
         factorise_mass();
     }
     bushing_turns(data_.forces, w, bushings_, turns_.data());
@@ -1019,12 +1026,12 @@ void System::evaluate_open(double t, const double* state, ForceLaws* laws) {
     } else {
         if (!data_.forces.empty()) {
             pinocchio_model::move_bodies(w);
-            pinocchio::computeJointJacobians(*w.model, w.data);
+            pinocchio::computeJointJacobians(w.model, w.data);
             add_forces(data_.forces, data_.coincident, w, t, state, v_.data(), bushings_, f_.data(),
                        laws);
         }
         std::copy(f_.begin(), f_.end(), w.tau.data());
-        pinocchio::aba(*w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
+        pinocchio::aba(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));
         std::copy(w.data.ddq.data(), w.data.ddq.data() + nv, rate_.begin());
     }
     if (!finite(rate_.data(), nv)) throw EvaluationError{Failure::acceleration};
@@ -1196,7 +1203,7 @@ void System::retract(const double* state, const double* delta, double* out) {
         auto& w = *work_;
         std::copy(state, state + nq, w.q.data());
         std::copy(delta, delta + nv, w.v.data());
-        pinocchio::integrate(*w.model, w.q, w.v, w.q2);
+        pinocchio::integrate(w.model, w.q, w.v, w.q2);
         for (const GroupJoint& joint : data_.groups)
             if (joint.group == Group::se2)
                 planar_translation(state + joint.position, delta + joint.start,
@@ -1267,12 +1274,12 @@ void System::difference(const double* start, const double* end, const double* ne
     Eigen::VectorXd from = Eigen::Map<const Eigen::VectorXd>(start, nq);
     const Eigen::VectorXd to = Eigen::Map<const Eigen::VectorXd>(end, nq);
     Eigen::VectorXd step(nv);
-    pinocchio::difference(*w.model, from, to, step);
+    pinocchio::difference(w.model, from, to, step);
     std::copy(step.data(), step.data() + nv, out);
     std::vector<double> moved(nq + nv);
     retract(start, out, moved.data());
     from = Eigen::Map<const Eigen::VectorXd>(moved.data(), nq);
-    pinocchio::difference(*w.model, from, to, step);
+    pinocchio::difference(w.model, from, to, step);
     for (int i = 0; i < nv; ++i) out[i] += step[i];
     for (int i : data_.wrapped_angles)
         out[i] += two_pi * std::nearbyint((near[i] - out[i]) / two_pi);
@@ -1413,7 +1420,7 @@ double System::closure_residual_at(double t, const double* state) {
     if (!closed_) return 0.0;
     auto& w = *work_;
     std::copy(state, state + nq, w.q.data());
-    pinocchio::crba(*w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
+    pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
     update_closures(state, false);
     update_drives(t, false);
     return closure_residual();
@@ -1431,7 +1438,7 @@ void System::working_forces(double* all, double* working) {
     auto& w = *work_;
     std::copy(f_.begin(), f_.end(), all);
     for (int i = 0; i < nv; ++i) working[i] = f_[i] + w.data.nle[i];
-    pinocchio::computeGeneralizedGravity(*w.model, w.data, Argument(w.q));
+    pinocchio::computeGeneralizedGravity(w.model, w.data, Argument(w.q));
     for (int i = 0; i < nv; ++i) working[i] -= w.data.g[i];
 }
 
@@ -1507,12 +1514,12 @@ std::array<double, 2> System::energies(const double* state, bool there) {
     auto& w = *work_;
     if (!there) move_bodies(state);
     double kinetic = 0.0, potential = potential_energy(data_.forces, w, state);
-    for (int i = 1; i < w.model->njoints; ++i) {
-        const auto& body = w.model->inertias[i];
+    for (int i = 1; i < w.model.njoints; ++i) {
+        const auto& body = w.model.inertias[i];
         kinetic += 0.5 * body.vtiv(w.data.v[i]);
-        potential -= body.mass() * w.model->gravity.linear().dot(w.data.oMi[i].act(body.lever()));
+        potential -= body.mass() * w.model.gravity.linear().dot(w.in_world(i, body.lever()));
     }
-    for (int i = 0; i < nv; ++i) kinetic += 0.5 * w.model->armature[i] * w.v[i] * w.v[i];
+    for (int i = 0; i < nv; ++i) kinetic += 0.5 * w.model.armature[i] * w.v[i] * w.v[i];
     return {kinetic, potential};
 }
 
@@ -1526,7 +1533,7 @@ void System::write_rows(double t, const double* q, double* G, int width) {
     auto& w = *work_;
     t = std::clamp(t, first_, last_);
     std::copy(q, q + nq, w.q.data());
-    pinocchio::computeJointJacobians(*w.model, w.data, Argument(w.q));
+    pinocchio::computeJointJacobians(w.model, w.data, Argument(w.q));
     update_closures(q, false);
     update_drives(t, false);
     const auto copy = [&](int row, int j) { G[row * width + j] = filled(row)[j]; };

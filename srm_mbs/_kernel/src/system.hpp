@@ -272,7 +272,7 @@ public:
     // and the Jacobian J (6, nv) of the joints in the world, column by column (manifold.cpp).
     void rows_and_mass(const double* q, double* G);
     const double* mass_matrix() const;
-    const double* world_jacobian() const;
+    std::vector<double> world_jacobian() const;
     // Where the placements were evaluated last, the diagonal of the bounding box of joints, centres of
     // mass and anchors; 0 if it is `rounding` over the distance or the gyration (regular_start.cpp).
     double scene_diagonal(double rounding) const;
@@ -389,7 +389,8 @@ private:
     void update_positions(const ClosureRows& closure, bool with_bias, double* rates);
     void update_alignments(const ClosureRows& closure, bool with_bias, double* rates);
     void update_joints(const JointRow& joints, const double* q, bool with_bias);
-    void fill(const ClosureRows& closure, int row, const Vec& force, const Vec& moment);
+    void fill(const ClosureRows& closure, int row, const Vec& force, const Vec& on_a,
+              const Vec& on_b);
     void update_drives(double t, bool with_bias);
     void completed(const double* white, double* out) const;
     const double* held_force(double t) const;

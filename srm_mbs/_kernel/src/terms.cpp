@@ -121,7 +121,7 @@ bool has_usual_joints(const Model& model) {
 }
 
 void move_bodies(Workspace& work, const std::vector<int>* joints) {
-    const Model& model = *work.model;
+    const Model& model = work.model;
     Data& data = work.data;
     const Argument q(work.q), v(work.v);
     if (!work.one_pass) {
@@ -139,7 +139,7 @@ void move_bodies(Workspace& work, const std::vector<int>* joints) {
 }
 
 void compute_terms(Workspace& work) {
-    const Model& model = *work.model;
+    const Model& model = work.model;
     Data& data = work.data;
     const Argument q(work.q), v(work.v);
     if (!work.one_pass) {

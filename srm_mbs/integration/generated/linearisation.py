@@ -30,7 +30,7 @@ from srm_mbs.integration.generated.differentiation import (
 )
 from srm_mbs.integration.generated.expressions import Expression, Output
 from srm_mbs.integration.generated.structure import ZERO, Bushing, Structure
-from srm_mbs.integration.generated.terms import Row, Trace
+from srm_mbs.integration.generated.terms import Row, Trace, seen_from
 from srm_mbs.integration.generated.vectors import (
     Vector,
     add,
@@ -97,8 +97,9 @@ class _Residual(Trace):
         axes = product(b.rotation, own_b[0])
         inverse = transposed(axes)
         factors = self.take(bushing.factors)
-        shift = times(inverse, subtract(point, origin))
-        rate = times(inverse, subtract(a.point_velocity(point), b.point_velocity(point)))
+        shift = times(inverse, self.between(a, point, b, origin))
+        seen = seen_from(b.place.base, point, a.place.base)
+        rate = times(inverse, subtract(a.point_velocity(point), b.point_velocity(seen)))
         x, y, z, c, slope = (self.recorder.leaf(f"turn[{first + i}]") for i in range(TURN_SIZE))
         phi = (x, y, z)
 
@@ -122,7 +123,7 @@ class _Residual(Trace):
             self.along_q[j] = {**self.along_q[j], **moves}
         force = times(axes, (acting[0], acting[1], acting[2]))
         moment = times(axes, turned((acting[3], acting[4], acting[5]), 1.0))
-        on_a = self.moved_by(columns, bushing.columns, factors, point, force, moment)
+        on_a = self.moved_by(columns, bushing.columns, factors, point, a.place.base, force, moment)
         return {j: -value for j, value in on_a}
 
 

@@ -57,7 +57,10 @@ class Motion(NamedTuple):
         Its first places in q and v.
     axis, pitch, placement
         Unit axis (3) and pitch (m/rad) of the kinds that have them; rotation, row by row, and
-        translation (12) from the parent.
+        translation (12) from the parent, on the ground from the base.
+    base
+        Place on the ground (3) from which the places in its tree are counted, of the first motion
+        of a tree: ``Workspace`` of workspace.hpp.
     inertia
         Mass, centre of mass (3), moments about it (6: xx, xy, xz, yy, yz, zz), in its own axes.
     """
@@ -69,6 +72,7 @@ class Motion(NamedTuple):
     axis: Span
     pitch: Span
     placement: Span
+    base: Span
     inertia: Span
 
 
@@ -489,9 +493,10 @@ def parameters_of_variant(mechanism: Mechanism, origin: Origin) -> FloatArray | 
             return None
         out[:] = numbers.values
     for joint in _differing_rows(tree.placements, origin.tree.placements):
-        placement = tree.placements[joint].tolist()
-        span = structure.motions[joint - 1].placement
-        _write(out, span, [*_turn(placement), *placement[9:]])
+        placement, motion = tree.placements[joint].tolist(), structure.motions[joint - 1]
+        base, above = (placement[9:], [0.0] * 3) if motion.base.length else ([], placement[9:])
+        _write(out, motion.base, base)
+        _write(out, motion.placement, [*_turn(placement), *above])
     for joint in _differing_rows(tree.bodies, origin.tree.bodies):
         _write(out, structure.motions[joint - 1].inertia, _inertia(tree.bodies[joint].tolist()))
     # Where a number was 0, a sign or no sign, the structure is another.
@@ -520,17 +525,23 @@ def _tree(model: pin.Model, numbers: _Numbers) -> tuple[tuple[Motion, ...], tupl
     motions: list[Motion] = []
     bodies = [-1]
     massless = [0.0] * 10
+    straight = not model.gravity.angular.any()
     for i in range(1, model.njoints):
         joint, placement = model.joints[i], numbers_of_joints.placements[i].tolist()
         body = numbers_of_joints.bodies[i].tolist()
+        base: list[float] = []
+        if not model.parents[i] and straight:
+            base, placement[9:] = placement[9:], [0.0] * 3
         parts = _parts(joint_type_data(joint), model.names[i], placement)
         parent, in_q, in_v = bodies[int(model.parents[i])], int(joint.idx_q), int(joint.idx_v)
         for part in parts:
             own = _inertia(body) if part is parts[-1] else massless
             spans = numbers.take(part.axis, units=True), numbers.take(part.pitch)
-            placed = numbers.rotated(part.placement)
-            motions.append(Motion(part.kind, parent, in_q, in_v, *spans, placed, numbers.take(own)))
-            parent = len(motions) - 1
+            placed = numbers.rotated(part.placement), numbers.take(base)
+            motions.append(
+                Motion(part.kind, parent, in_q, in_v, *spans, *placed, numbers.take(own))
+            )
+            parent, base = len(motions) - 1, []
             nq, nv = _SIZES.get(part.kind, (2 if part.kind == "unbounded" else 1, 1))
             in_q, in_v = in_q + nq, in_v + nv
         bodies.append(parent)

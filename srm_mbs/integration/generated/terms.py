@@ -67,18 +67,20 @@ Row = dict[int, Expression]
 
 
 class Column(NamedTuple):
-    """The motion of a body by one rate; linear: that of its point at the frame's origin."""
+    """The motion of a body by one rate; linear: that of its point at the base of its tree."""
 
     in_v: int
     linear: Vector
     angular: Vector
+    base: Vector
 
 
 class Place(NamedTuple):
-    """Where a body is."""
+    """Where a body is: its points are counted from the base of its tree."""
 
     rotation: Matrix
     origin: Vector
+    base: Vector
 
     def point(self, local: Vector) -> Vector:
         """The place of a point of the body."""
@@ -86,7 +88,7 @@ class Place(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A body that moves; the velocity is of its point at the frame's origin, the acceleration of
+    """A body that moves; the velocity is of its point at the base of its tree, the acceleration of
     its own origin."""
 
     place: Place
@@ -170,6 +172,11 @@ class Inertia(NamedTuple):
         )
         centre = add(self.centre, scaled(share, apart))
         return Inertia(mass, centre, self.moments.plus(other.moments).plus(shifted))
+
+
+def seen_from(base: Vector, x: Vector, of: Vector) -> Vector:
+    """The point ``x``, which is counted from the base ``of``, counted from another."""
+    return x if base is of else add(x, subtract(of, base))
 
 
 GROUND = -1
@@ -337,29 +344,42 @@ class Trace:
         rotation = self._of_quaternion(first + 3)
         return rotation, (q[first], q[first + 1], q[first + 2]), [*shifts, *turns]
 
+    def base(self, motion: Motion) -> Vector:
+        """The base of a tree, by its first motion; none by others."""
+        return self.vector(motion.base) if motion.base.length else self.nothing
+
     def _places(self, frame: int) -> dict[int, Place]:
         """Where the bodies are in the frame of one of them: those on its way to the ground, and
-        then the others."""
+        then the others.
+
+        In the frame of the ground rounding follows the size of a tree, not its distance from the
+        origin of the world: every tree has a base.
+        """
         motions = self.structure.motions
-        out = {frame: Place(self.units, self.nothing)}
+        out = {frame: Place(self.units, self.nothing, self.nothing)}
         number = frame
         while number >= 0:
-            motion, (rotation, origin) = motions[number], out[number]
+            motion, (rotation, origin, _) = motions[number], out[number]
             placed, at = self.placement(motion.placement)
             turned, moved, _ = self.joints[number]
             before = product(rotation, transposed(turned))
             above = product(before, transposed(placed))
-            way = add(times(above, at), times(before, moved))
+            way = add(times(above, add(self.base(motion), at)), times(before, moved))
             number = motion.parent
-            out[number] = Place(above, subtract(origin, way))
+            out[number] = Place(above, subtract(origin, way), self.nothing)
         for number, motion in enumerate(motions):
             if number not in out:
                 parent = out[motion.parent]
                 placed, at = self.placement(motion.placement)
                 turned, moved, _ = self.joints[number]
                 before = product(parent.rotation, placed)
+                base = parent.base
+                if motion.parent < 0 and frame == GROUND:
+                    base = self.base(motion)
+                else:
+                    at = add(self.base(motion), at)
                 origin = add(parent.point(at), times(before, moved))
-                out[number] = Place(product(before, turned), origin)
+                out[number] = Place(product(before, turned), origin, base)
         return out
 
     def _move(self, number: int, motion: Motion) -> None:
@@ -367,14 +387,15 @@ class Trace:
         parent = self.ground if motion.parent < 0 else self.bodies[motion.parent]
         self.roots.append(number if motion.parent < 0 else self.roots[motion.parent])
         place = self.places[number]
-        rotation, origin = place
+        rotation, origin, base = place
         own = []
         linear, angular, ahead = self.nothing, self.nothing, self.nothing
         _, _, subspace = self.joints[number]
-        bias, spin_bias = parent.point_bias(origin), parent.spin_bias
+        at = seen_from(parent.place.base, origin, base)
+        bias, spin_bias = parent.point_bias(at), parent.spin_bias
         for i, (shift, turn) in enumerate(subspace, motion.in_v):
             along, about = times(rotation, shift), times(rotation, turn)
-            column = Column(i, add(along, cross(origin, about)), about)
+            column = Column(i, add(along, cross(origin, about)), about, base)
             own.append(column)
             linear = add(linear, scaled(self.v[i], column.linear))
             angular = add(angular, scaled(self.v[i], about))
@@ -470,6 +491,12 @@ class Trace:
                 self.outputs.append(Output(target, value, self.roots[number]))
             above = self.structure.motions[above].parent
 
+    def between(self, a: Body, at_a: Vector, b: Body, at_b: Vector) -> Vector:
+        """From a point of b to one of a."""
+        if b is self.ground:  # what does not move is subtracted from what does not
+            return subtract(at_a, seen_from(a.place.base, at_b, b.place.base))
+        return subtract(seen_from(b.place.base, at_a, a.place.base), at_b)
+
     # -- closures
 
     def rows(self) -> None:
@@ -518,14 +545,15 @@ class Trace:
             return
         a, b = self.body(closure.joint_a), self.body(closure.joint_b)
         x = a.point(self.vector(closure.at_a))
-        apart = subtract(x, b.point(self.vector(closure.at_b)))
-        rate = subtract(a.point_velocity(x), b.point_velocity(x))
-        change = subtract(a.point_bias(x), b.point_bias(x))
+        apart = self.between(a, x, b, b.point(self.vector(closure.at_b)))
+        seen = seen_from(b.place.base, x, a.place.base)
+        rate = subtract(a.point_velocity(x), b.point_velocity(seen))
+        change = subtract(a.point_bias(x), b.point_bias(seen))
         change = subtract(change, scaled(self.recorder.constant(2.0), cross(b.spin, rate)))
-        moved = [
-            (j, sign, add(columns[j].linear, cross(columns[j].angular, x)))
-            for j, sign in closure.support
-        ]
+        moved = []
+        for j, sign in closure.support:
+            at = seen_from(columns[j].base, x, a.place.base)
+            moved.append((j, sign, add(columns[j].linear, cross(columns[j].angular, at))))
         row = closure.first_row
 
         def along(d: Vector, value: Expression, acceleration: Expression) -> None:
@@ -606,7 +634,7 @@ class Trace:
 
     def bushing_bodies(self) -> None:
         """The outputs B and J: placements and velocities in the axes of the bodies, and columns of
-        the world Jacobian."""
+        the Jacobian in world axes."""
         for k, joint in enumerate(self.structure.bushing_joints):
             body, cell = self.body(joint), self.roots[self.structure.bodies[joint]]
             inverse = transposed(body.rotation)
@@ -688,7 +716,8 @@ class Trace:
         point, acting, moment = (
             self._wrench(force) if kind == "wrench" else self._spring(force, k, d, rest)
         )
-        return self.moved_by(columns, force.columns, factors, point, acting, moment)
+        base = self.body(force.joint_a).place.base
+        return self.moved_by(columns, force.columns, factors, point, base, acting, moment)
 
     def moved_by(
         self,
@@ -696,18 +725,18 @@ class Trace:
         moving: Sequence[int],
         factors: Sequence[Expression],
         point: Vector,
+        base: Vector,
         force: Vector,
         moment: Vector,
     ) -> list[tuple[int, Expression]]:
-        """The generalised forces of a force at a point and a moment."""
-        about_origin = add(moment, cross(point, force))
-        return [
-            (
-                j,
-                factor * (dot(columns[j].linear, force) + dot(columns[j].angular, about_origin)),
-            )
-            for j, factor in zip(moving, factors)
-        ]
+        """The generalised forces of a force at a point, counted from ``base``, and a moment."""
+        out = []
+        for j, factor in zip(moving, factors):
+            column = columns[j]
+            about_base = add(moment, cross(seen_from(column.base, point, base), force))
+            value = dot(column.linear, force) + dot(column.angular, about_base)
+            out.append((j, factor * value))
+        return out
 
     def _over_time(self, force: Force) -> list[Expression]:
         """The numbers of an element, times the values of their laws."""
@@ -759,7 +788,7 @@ class Trace:
         a, b = self.body(force.joint_a), self.body(force.joint_b)
         _, at_a = self._frame(force.joint_a, force.at_a)
         _, at_b = self._frame(force.joint_b, force.at_b)
-        apart = subtract(at_a, at_b)
+        apart = self.between(a, at_a, b, at_b)
         if d.is_zero:
             rate = self.nothing
         else:

@@ -239,8 +239,8 @@ def test_ends_beside_a_passage_of_many_loops_take_no_more_evaluations_than_the_p
         assert solution.success
         expected = reduced.integrate(reduced.n_four_bar(loops), start, passage + beside)
         wrong = max(abs(solution.q[-1, 0] - expected[0]), abs(solution.v[-1, 0] - expected[1]))
-        # Of 80 loops rounding in direct solves at sigma of 3e-3 is 2e-9.
-        assert wrong < max(rtol, 5e-9)
+        # Of many loops rounding in direct solves at sigma of 3e-3 is up to 1e-9.
+        assert wrong < max(rtol, 2e-9)
         assert solution.stats.steps <= through.steps
         assert solution.stats.evaluations < 2 * through.evaluations
 

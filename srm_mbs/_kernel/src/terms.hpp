@@ -15,7 +15,8 @@ bool has_usual_joints(const pinocchio::Model& model);
 
 // Pinocchio's crba (WORLD) and nonLinearEffects at q and v of the workspace in one pass: the same
 // statements, joint by joint; common terms (those of the joint, placements) are computed once.
-// Computes M, nle, J, oMi, v, a_gf as the two algorithms do; Ag refers to the origin of the world.
+// Computes M, nle, J, oMi, v, a_gf as the two algorithms do; J, oMi and Ag refer to the bases of the
+// trees.
 // With other joints it calls the two algorithms.
 void compute_terms(Workspace& work);
 

@@ -35,7 +35,7 @@ from srm_mbs.dynamics.constraints.projection import (
 )
 from srm_mbs.dynamics.constraints.rheonomic import DrivenKinematics
 from srm_mbs.dynamics.constraints.row_algebra import graph_order
-from srm_mbs.dynamics.constraints.rows import COINCIDENT
+from srm_mbs.dynamics.constraints.rows import COINCIDENT, Trees, trees_of
 from srm_mbs.dynamics.constraints.structure import coordinate_tree, rows_in_use
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.forces import (
@@ -619,8 +619,23 @@ class ClosedSystem(Mechanics):
     @cached_property
     def loops(self) -> DrivenKinematics:
         """The rows of closures and drives that are in use, with memory of their own."""
+        rows, trees = self._followed_rows(), self._trees
+        return rows if trees is None else rows.count_from(trees.bases)
+
+    def _followed_rows(self) -> DrivenKinematics:
         curves = self.mechanism.drive_curves
         return rows_in_use(self.mechanism).copy_workspace().follow(curves)
+
+    @cached_property
+    def _trees(self) -> Trees | None:
+        # Rows of coordinates alone have no places.
+        return trees_of(self.model) if rows_in_use(self.mechanism).anchors() else None
+
+    @cached_property
+    def _tree(self) -> tuple[pin.Model, pin.Data]:
+        """Model and workspace of the closures; forces of elements have places in the world."""
+        trees = self._trees
+        return (self.model, self.data) if trees is None else (trees.model, workspace(self.model))
 
     @cached_property
     def _terms(self) -> ClosedTerms:
@@ -629,7 +644,7 @@ class ClosedSystem(Mechanics):
     @cached_property
     def _mass_matrix(self) -> FloatArray:
         """View (nv, nv) of what crba writes: finding it takes as long as a solve."""
-        return self.data.M  # type: ignore[no-any-return]
+        return self._tree[1].M  # type: ignore[no-any-return]
 
     @cached_property
     def _joined(self) -> ForceKinematics | None:
@@ -654,7 +669,9 @@ class ClosedSystem(Mechanics):
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""
         own = super().constants()
-        return own | {"drives": self.loops.drive_constants()} if self.mechanism.drives else own
+        if not self.mechanism.drives:
+            return own
+        return own | {"drives": self._followed_rows().drive_constants()}
 
     def constants_of_model(self) -> dict[str, Any]:
         """As for open mechanisms, and the rows of the closures."""
@@ -717,13 +734,16 @@ class ClosedSystem(Mechanics):
         if not blas.dasum(state) < _OVERFLOW:
             raise EvaluationError("the state is not finite, or overflows")
         t = min(max(t, self._first), self._last)
-        model, data, nq = self.model, self.data, self.nq
+        (model, data), nq = self._tree, self.nq
         q, v = state[:nq], state[nq:]
         pin.crba(model, data, q, _WORLD)
         f = -pin.nonLinearEffects(model, data, q, v)
         if self._is_loaded or self._applied is not None:
             f += self.applied_force(t, q, v)
         if self._forces is not None:
+            if data is not self.data:
+                pin.forwardKinematics(self.model, self.data, q, v)
+                pin.computeJointJacobians(self.model, self.data)
             f += self._element_force(self._forces, t, q, v)
         self._laws_at = q, v
         loops = self.loops
@@ -764,7 +784,7 @@ class ClosedSystem(Mechanics):
             As :meth:`evaluate`.
         """
         loops, p = self.loops, self.projection
-        loops.evaluate(self.model, self.data, q)
+        loops.evaluate(*self._tree, q)
         p.factor(self._mass_matrix, loops.G, n, np.zeros(len(loops.g)), None)
         white = p.white_force
         return p.unwhiten(white), p.unwhiten(white - p.Q @ (p.Q.T @ white))
@@ -788,7 +808,7 @@ class ClosedSystem(Mechanics):
         """Scaled g - s (m,) and G v - s' (m,) of the kept rows at the time t (s)."""
         q, v = self.split(state)
         rows = self.loops
-        rows.evaluate(self.model, self.data, q)
+        rows.evaluate(*self._tree, q)
         rows.move_to(t)
         return rows.g.copy(), rows.G @ v - rows.target_rate
 

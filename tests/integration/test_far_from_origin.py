@@ -53,7 +53,7 @@ def moved(mechanism: srm.Mechanism, by: FloatArray) -> srm.Mechanism:
     )
 
 
-@pytest.mark.parametrize("backend", ["kernel", "generated"])
+@pytest.mark.parametrize("backend", ["python", "kernel", "generated"])
 @pytest.mark.parametrize("rtol", [1e-6, 1e-12])
 def test_passages_one_kilometre_away_are_those_near_the_origin(backend: str, rtol: float) -> None:
     mechanism = load("n_four_bar_2")
@@ -86,7 +86,7 @@ def forced() -> srm.Mechanism:
     )
 
 
-@pytest.mark.parametrize("backend", ["kernel", "generated"])
+@pytest.mark.parametrize("backend", ["python", "kernel", "generated"])
 @pytest.mark.parametrize("tableau", ["dop853", "rodas5p"])
 def test_elements_between_trees_far_away_act_as_those_of_the_reference_at_the_origin(
     backend: str, tableau: str

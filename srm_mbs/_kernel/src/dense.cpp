@@ -29,6 +29,8 @@ DenseOutput::DenseOutput(int nq, int nv, const std::vector<SchemeDense>& schemes
       steps_(std::move(steps)),
       n_(2 * nv),
       nx_(nq + nv),
+      extra_(steps_.count),
+      polynomials_(steps_.count),
       places_(steps_.count, Place::unknown),
       delta_(n_),
       x_(std::max(nx_, n_)),
@@ -359,7 +361,7 @@ const DenseOutput::Polynomial& DenseOutput::best_polynomial(System& system, long
         const double change = std::min(changes[0], changes[1]);
         if (!(change < best) && !out.points.empty()) continue;
         best = change;
-        out = tried_[changes[1] <= changes[0] ? 1 : 0];
+        std::swap(out, tried_[changes[1] <= changes[0] ? 1 : 0]);
     }
     return out;
 }

@@ -3,7 +3,6 @@
 
 #include <limits>
 #include <memory>
-#include <unordered_map>
 #include <utility>
 #include <vector>
 
@@ -153,9 +152,9 @@ private:
     DenseConstants constants_;
     StepArrays steps_;
     const int n_, nx_;
-    // Of each step that needed them.
-    std::unordered_map<long, std::vector<double>> extra_;
-    std::unordered_map<long, Polynomial> polynomials_;
+    // Of each step, empty until it needs them.
+    std::vector<std::vector<double>> extra_;
+    std::vector<Polynomial> polynomials_;
     enum class Place : char { unknown, regular, near_singular };
     std::vector<Place> places_;
     std::vector<double> delta_, x_, weights_, near_, rate_, points_, slopes_, differences_;

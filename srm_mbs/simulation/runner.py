@@ -650,11 +650,11 @@ def integrate_problem(
 def _starts_too_fast(record: RunRecord, options: RunOptions) -> bool:
     """Whether a run that may take implicit steps stopped because the first step that it chose is
     below round-off."""
+    if record.stop_reason is not StopReason.ROUND_OFF or len(record.times):
+        return False
     scheme = options.method.scheme
     implicit = scheme.implicit is not None or scheme.stiff is not None
-    chosen = options.step is None and options.first_step is None
-    failed = record.stop_reason is StopReason.ROUND_OFF and not len(record.times)
-    return implicit and chosen and failed
+    return implicit and options.step is None and options.first_step is None
 
 
 def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counters]:

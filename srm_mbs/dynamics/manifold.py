@@ -181,8 +181,8 @@ class Manifold:
 
     def __init__(self, mechanism: Mechanism) -> None:
         self.mechanism = mechanism
-        self.model = model = mechanism.model
-        self.nq, self.nv = model.nq, model.nv
+        self.model = mechanism.model
+        self.nq, self.nv = len(mechanism.q0), len(mechanism.v0)
         self.tangent_size = 2 * self.nv
         self._flat = self.nq == self.nv
         self._unit = mechanism.structure.units.coordinate

@@ -230,6 +230,13 @@ def _constants(mechanism: Mechanism) -> dict[str, Any]:
     return {}
 
 
+@per_model
+def _resistance(mechanism: Mechanism) -> tuple[FloatArray, FloatArray, bool, bool]:
+    """Damping and friction (nv,) of the joints, and whether there are any."""
+    damping, friction = mechanism.model.damping.copy(), mechanism.model.friction.copy()
+    return damping, friction, bool(damping.any()), bool(friction.any())
+
+
 class Mechanics(Manifold):
     """Applied forces, energy and constants of a mechanism and its controller, open or closed."""
 
@@ -245,11 +252,7 @@ class Mechanics(Manifold):
         self.multiplier_size = self.nv
         self.evaluations = 0
         self._controller = controller
-        self._damping: FloatArray = self.model.damping.copy()
-        self._friction: FloatArray = self.model.friction.copy()
-        # Of a list, because any() of a short array costs five times as much.
-        self.is_damped = any(self._damping.tolist())
-        self.has_friction = any(self._friction.tolist())
+        self._damping, self._friction, self.is_damped, self.has_friction = _resistance(mechanism)
         self._is_loaded = self.is_damped or self.has_friction or controller is not None
         self.friction_speed = mechanism.friction_speed
         self._forces = resolved_forces(mechanism)
@@ -492,7 +495,8 @@ class Mechanics(Manifold):
         return known | self.constants_of_start()
 
     def constants_of_start(self) -> dict[str, Any]:
-        """Those among :meth:`constants` that depend on the start, or that the model may change."""
+        """Those among :meth:`constants` that depend on the start, or that variants with the same
+        rows have of their own."""
         return {
             "unit": self._unit,
             "residual_scale": self.residual_scale,

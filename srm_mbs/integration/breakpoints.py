@@ -220,6 +220,8 @@ class BreakpointHandler:
         return float(self._intervals.ends[self._index])
 
     def _evaluate_within(self, index: int) -> None:
+        if self._intervals.unbroken:
+            return  # the system may be evaluated at any time
         first, last = self._intervals.first[index], self._intervals.last[index]
         self._evaluator.between(float(first), float(last))
 
@@ -306,4 +308,5 @@ class BreakpointHandler:
 
     def done(self) -> None:
         """The run is over: the system may be evaluated at any time."""
-        self._evaluator.between(-np.inf, np.inf)
+        if not self._intervals.unbroken:
+            self._evaluator.between(-np.inf, np.inf)

@@ -142,23 +142,25 @@ class RunRecord:
 
     t0: float
     x0: FloatArray
-    steps: list[StepResult] = field(default_factory=list)
-    times: list[float] = field(default_factory=list)
-    attempts: list[Attempt] = field(default_factory=list)
-    status: RunStatus = RunStatus.RUNNING
-    stop_reason: StopReason | None = None
-    message: str = ""
-    error: BaseException | None = None
-    stop: float | None = None
-    stop_state: FloatArray | None = None
-    wall_time: float = 0.0
-    breaks: list[int] = field(default_factory=list)
-    made: int = 0
-    watched_time: float = 0.0
-    rest: tuple[float, FloatArray] | None = None
-    memory: IntegratorState | None = None
-    cause: FailureCause | None = None
-    _failure: tuple[RunFailure, float, float, float, bool, ProblemVocabulary] | None = None
+    steps: list[StepResult] = field(default_factory=list, init=False)
+    times: list[float] = field(default_factory=list, init=False)
+    attempts: list[Attempt] = field(default_factory=list, init=False)
+    status: RunStatus = field(default=RunStatus.RUNNING, init=False)
+    stop_reason: StopReason | None = field(default=None, init=False)
+    message: str = field(default="", init=False)
+    error: BaseException | None = field(default=None, init=False)
+    stop: float | None = field(default=None, init=False)
+    stop_state: FloatArray | None = field(default=None, init=False)
+    wall_time: float = field(default=0.0, init=False)
+    breaks: list[int] = field(default_factory=list, init=False)
+    made: int = field(default=0, init=False)
+    watched_time: float = field(default=0.0, init=False)
+    rest: tuple[float, FloatArray] | None = field(default=None, init=False)
+    memory: IntegratorState | None = field(default=None, init=False)
+    cause: FailureCause | None = field(default=None, init=False)
+    _failure: tuple[RunFailure, float, float, float, bool, ProblemVocabulary] | None = field(
+        default=None, init=False
+    )
     """Arguments of :meth:`mark_failed`."""
 
     def mark_finished(self, t_end: float) -> None:

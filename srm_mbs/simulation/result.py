@@ -458,8 +458,8 @@ class SimulationResult(RunOutcome):
             If a time lies outside the run, or t has more than one dimension.
         """
         times = checked_output_times(t, scalar=True)
-        states = self._dense(np.atleast_1d(times))
-        nq = self.mechanism.model.nq
+        states = self._dense(times.reshape(-1))
+        nq = self._system.nq
         q, v = states[:, :nq], states[:, nq:]
         return (q[0], v[0]) if times.ndim == 0 else (q, v)
 

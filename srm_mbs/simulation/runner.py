@@ -232,11 +232,7 @@ def run_segment(
         mechanism was switched.
     """
     problem = assemble_problem(mechanism, options, before)
-    log_start(mechanism.name, options, problem.norm, problem.backend)
-    record, counters, kernel_system = integrate_problem(problem, workspaces)
-    if before is None:
-        raise_at_first_call(record.error, options.t0)
-    lead_with_cause(problem, record)
+    record, counters, kernel_system = _make_record(problem, workspaces, before is None)
     end = record.end_of_steps()
     result = assemble_result(problem, record, counters, kernel_system, result_type)
     log_end(mechanism.name, result)
@@ -246,7 +242,24 @@ def run_segment(
 def run_whole(mechanism: Mechanism, options: RunOptions, result_type: type[Result]) -> Result:
     """A run without event actions; the parameters are those of :func:`run_segment`."""
     with SuccessiveWorkspaces() as workspaces:
-        return run_segment(mechanism, options, result_type, workspaces).result
+        problem = assemble_problem(mechanism, options)
+        made = _make_record(problem, workspaces, True)
+        result = assemble_result(problem, *made, result_type)
+        log_end(mechanism.name, result)
+        return result
+
+
+def _make_record(
+    problem: Problem, workspaces: SuccessiveWorkspaces, first: bool
+) -> tuple[RunRecord, Counters, Any]:
+    """As :func:`integrate_problem`, logged, with the cause of a failure; ``first``: no segment was
+    made before."""
+    log_start(problem.mechanism.name, problem.options, problem.norm, problem.backend)
+    record, counters, kernel_system = integrate_problem(problem, workspaces)
+    if first:
+        raise_at_first_call(record.error, problem.options.t0)
+    lead_with_cause(problem, record)
+    return record, counters, kernel_system
 
 
 def lead_with_cause(problem: Problem, record: RunRecord) -> None:
@@ -637,11 +650,11 @@ def integrate_problem(
 def _starts_too_fast(record: RunRecord, options: RunOptions) -> bool:
     """Whether a run that may take implicit steps stopped because the first step that it chose is
     below round-off."""
+    if record.stop_reason is not StopReason.ROUND_OFF or len(record.times):
+        return False
     scheme = options.method.scheme
     implicit = scheme.implicit is not None or scheme.stiff is not None
-    chosen = options.step is None and options.first_step is None
-    failed = record.stop_reason is StopReason.ROUND_OFF and not len(record.times)
-    return implicit and chosen and failed
+    return implicit and options.step is None and options.first_step is None
 
 
 def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counters]:

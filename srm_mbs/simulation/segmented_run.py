@@ -292,10 +292,11 @@ def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
     ControllerError, EventError
         If a function of the user fails where it is called first.
     """
-    if isinstance(options.events, Iterator):  # they are looked at more than once
-        options = options._replace(events=list(options.events))
+    events = options.events
+    if events is not None and isinstance(events, Iterator):  # they are looked at more than once
+        options = options._replace(events=list(events))
     checked = checked_options(mechanism, options)
-    if acting(options.events):
+    if events is not None and acting(options.events):
         with SuccessiveWorkspaces() as workspaces:
             result = _run_segments(mechanism, checked, types, workspaces)
     else:

@@ -79,7 +79,10 @@ public:
           all_(closures.rows),
           rank_(closures.system.structural_rank()),
           g_(rank_),
-          G_(static_cast<std::size_t>(rank_) * n_) {}
+          G_(static_cast<std::size_t>(rank_) * n_),
+          ahead_(n_),
+          behind_(n_),
+          move_(n_) {}
 
     bool run(const std::vector<double>& place, double time) {
         x_ = place;
@@ -225,27 +228,28 @@ private:
         const double length = constants_.critical_difference;
         const ColumnGroups& columns = closures_.system.column_groups();
         hessian_.assign(static_cast<std::size_t>(n_) * n_, 0.0);
-        std::vector<double> ahead(n_), behind(n_, 0.0);
+        std::fill(behind_.begin(), behind_.end(), 0.0);
         if (!central)
-            for (int i = 0; i < rank_; ++i) add(u_[i], &G_[i * n_], behind.data(), n_);
+            for (int i = 0; i < rank_; ++i) add(u_[i], &G_[i * n_], behind_.data(), n_);
         const double apart = central ? 2.0 * length : length;
         for (const std::vector<int>& group : columns.groups) {
-            gradient(group, length, ahead);
-            if (central) gradient(group, -length, behind);
+            gradient(group, length, ahead_);
+            if (central) gradient(group, -length, behind_);
             for (const int j : group)
                 for (const int k : columns.neighbours[j])
-                    hessian_[k * n_ + j] = (ahead[k] - behind[k]) / apart;
+                    hessian_[k * n_ + j] = (ahead_[k] - behind_[k]) / apart;
         }
         return finite(hessian_.data(), n_ * n_);
     }
 
     // G^T u (n,) where the coordinates of `group` have moved by `length`.
     void gradient(const std::vector<int>& group, double length, std::vector<double>& out) {
-        std::vector<double> move(n_, 0.0), x(x_);
-        for (const int j : group) move[j] = length;
+        std::fill(move_.begin(), move_.end(), 0.0);
+        for (const int j : group) move_[j] = length;
+        there_ = x_;
         double time = time_;
-        closures_.move(move.data(), x, time);
-        closures_.evaluate(x, time);
+        closures_.move(move_.data(), there_, time);
+        closures_.evaluate(there_, time);
         std::fill(out.begin(), out.end(), 0.0);
         for (int i = 0; i < rank_; ++i)
             add(u_[i], &closures_.G[chosen_[i] * n_], out.data(), n_);
@@ -276,6 +280,7 @@ private:
     const Constants& constants_;
     const int n_, all_, rank_;
     std::vector<double> g_, G_, u_, hessian_, x_, moved_;
+    std::vector<double> ahead_, behind_, move_, there_;  // of differentiate()
     double last_move_ = std::numeric_limits<double>::infinity();
     std::vector<int> chosen_;
     double time_ = 0.0, delta_ = 0.0;

@@ -29,6 +29,8 @@ DenseOutput::DenseOutput(int nq, int nv, const std::vector<SchemeDense>& schemes
       steps_(std::move(steps)),
       n_(2 * nv),
       nx_(nq + nv),
+      extra_(steps_.count),
+      polynomials_(steps_.count),
       places_(steps_.count, Place::unknown),
       delta_(n_),
       x_(std::max(nx_, n_)),
@@ -258,22 +260,23 @@ double DenseOutput::variable(long step, double theta, bool in_layer, double* gro
     return std::asinh(beside);
 }
 
-// Divided differences of the states and rates at ends of steps, in the chart of the step.
-void DenseOutput::hermite(System& system, long step, const Nodes& nodes, bool in_layer,
-                          Polynomial& out) {
+// The polynomials through `sets` of ends of steps, from divided differences of the states and rates
+// there, in the chart of the step.  Those of the last set contain those of sets that are part of it.
+void DenseOutput::hermite(System& system, long step, const Nodes* sets, int set_count,
+                          bool in_layer, Polynomial* out) {
     const double *times = steps_.times, *start = steps_.states + step * nx_;
     const double h = times[step + 1] - times[step];
+    const Nodes& nodes = sets[set_count - 1];
     const int k = 2 * nodes.count;
-    out.in_layer = in_layer;
-    out.points.resize(k);
-    out.coefficients.resize(static_cast<std::size_t>(k) * n_);
+    points_.resize(k);
+    differences_.resize(static_cast<std::size_t>(k) * n_);
     slopes_.resize(static_cast<std::size_t>(nodes.count) * n_);
-    std::vector<double>& c = out.coefficients;
+    std::vector<double>& c = differences_;
     const long last = smooth_interval(step).second;
     for (int node = 0; node < nodes.count; ++node) {
         const long i = nodes.at[node];
         double growth;
-        out.points[2 * node] = out.points[2 * node + 1] =
+        points_[2 * node] = points_[2 * node + 1] =
             variable(step, (times[i] - times[step]) / h, in_layer, &growth);
         double* const here = &c[2 * node * n_];
         double* const slope = &slopes_[node * n_];
@@ -283,9 +286,20 @@ void DenseOutput::hermite(System& system, long step, const Nodes& nodes, bool in
         system.chart_rate(here, rate_at(i, last), slope);
         for (int m = 0; m < n_; ++m) slope[m] *= h / growth;
     }
-    for (int order = 1; order < k; ++order) {
-        for (int i = k - 1; i >= order; --i) {
-            const double span = out.points[i] - out.points[i - order];
+    int first[3];  // row of each set's first end; -1: the set is no part of the last one
+    for (int set = 0; set < set_count; ++set) {
+        const long *from = sets[set].at, *end = nodes.at + nodes.count;
+        const long* const found = std::search(nodes.at, end, from, from + sets[set].count);
+        first[set] = found == end ? -1 : 2 * static_cast<int>(found - nodes.at);
+        if (found == end) continue;
+        out[set].in_layer = in_layer;
+        out[set].points.assign(&points_[first[set]], &points_[first[set]] + 2 * sets[set].count);
+        out[set].coefficients.resize(static_cast<std::size_t>(2) * sets[set].count * n_);
+    }
+    // Row i has the difference over the points i - order to i.
+    for (int order = 0; order < k; ++order) {
+        for (int i = k - 1; i >= order && order > 0; --i) {
+            const double span = points_[i] - points_[i - order];
             double* const here = &c[i * n_];
             if (span == 0.0) {
                 std::copy_n(&slopes_[(i / 2) * n_], n_, here);
@@ -295,7 +309,12 @@ void DenseOutput::hermite(System& system, long step, const Nodes& nodes, bool in
                 for (int m = 0; m < n_; ++m) here[m] = (here[m] - below[m]) * by;
             }
         }
+        for (int set = 0; set < set_count; ++set)
+            if (first[set] >= 0 && order < 2 * sets[set].count)
+                std::copy_n(&c[(first[set] + order) * n_], n_, &out[set].coefficients[order * n_]);
     }
+    for (int set = 0; set < set_count; ++set)
+        if (first[set] < 0) hermite(system, step, &sets[set], 1, in_layer, &out[set]);
 }
 
 void DenseOutput::value(const Polynomial& polynomial, double theta, double* out) const {
@@ -327,7 +346,7 @@ const DenseOutput::Polynomial& DenseOutput::best_polynomial(System& system, long
     for (const auto& [in_layer, chosen] :
          {std::pair(false, &ends), {false, &away}, {true, &ends}}) {
         if (in_layer ? !layer : chosen == &away && same) continue;
-        for (int k = 0; k < 3; ++k) hermite(system, step, (*chosen)[k], in_layer, tried_[k]);
+        hermite(system, step, *chosen, 3, in_layer, tried_);
         double changes[2] = {0.0, 0.0};
         for (const double theta : constants_.probes) {
             const double at = variable(step, theta, in_layer);
@@ -342,7 +361,7 @@ const DenseOutput::Polynomial& DenseOutput::best_polynomial(System& system, long
         const double change = std::min(changes[0], changes[1]);
         if (!(change < best) && !out.points.empty()) continue;
         best = change;
-        out = tried_[changes[1] <= changes[0] ? 1 : 0];
+        std::swap(out, tried_[changes[1] <= changes[0] ? 1 : 0]);
     }
     return out;
 }

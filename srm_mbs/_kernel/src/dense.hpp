@@ -3,7 +3,6 @@
 
 #include <limits>
 #include <memory>
-#include <unordered_map>
 #include <utility>
 #include <vector>
 
@@ -133,7 +132,8 @@ private:
                 long reach = std::numeric_limits<long>::max()) const;
     void motion(long step, long node, double* out) const;
     Nodes nodes_away(const System* charts, long step, int count) const;
-    void hermite(System& system, long step, const Nodes& nodes, bool in_layer, Polynomial& out);
+    void hermite(System& system, long step, const Nodes* sets, int set_count, bool in_layer,
+                 Polynomial* out);
     double variable(long step, double theta, bool in_layer, double* growth = nullptr) const;
     void value(const Polynomial& polynomial, double theta, double* out) const;
 
@@ -152,12 +152,12 @@ private:
     DenseConstants constants_;
     StepArrays steps_;
     const int n_, nx_;
-    // Of each step that needed them.
-    std::unordered_map<long, std::vector<double>> extra_;
-    std::unordered_map<long, Polynomial> polynomials_;
+    // Of each step, empty until it needs them.
+    std::vector<std::vector<double>> extra_;
+    std::vector<Polynomial> polynomials_;
     enum class Place : char { unknown, regular, near_singular };
     std::vector<Place> places_;
-    std::vector<double> delta_, x_, weights_, near_, rate_, slopes_;
+    std::vector<double> delta_, x_, weights_, near_, rate_, points_, slopes_, differences_;
     Polynomial tried_[3];
 };
 

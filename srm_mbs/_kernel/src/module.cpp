@@ -1095,7 +1095,6 @@ struct PyEventWatch final : EventSearch::Functions {
 struct PyRecords {
     StepRecords records;
     std::vector<double> end_rate;
-    std::vector<double> numbers;  // (5, steps)
     std::size_t nx, n, stages, corrected;  // stages: those of a step and its end
 };
 
@@ -1240,9 +1239,6 @@ struct PyRun {
         run->records.clear();
         out.records.times.insert(out.records.times.begin(), t0);
         out.records.states.insert(out.records.states.begin(), start.begin(), start.end());
-        const StepRecords& r = out.records;
-        for (const auto* values : {&r.ranks, &r.error_ratios, &r.placements, &r.held, &r.stiff})
-            out.numbers.insert(out.numbers.end(), values->begin(), values->end());
         out.end_rate = run->end_rate;
         out.nx = start.size();
         out.n = 2 * static_cast<std::size_t>(s.nv);
@@ -1331,9 +1327,12 @@ void bind_run(nb::module_& m) {
               return view(values, {r.records.breaks.size(), r.n}, self);
           });
     // Rows: ranks, error ratios, placements, held, stiff.
-    records.def_prop_ro("numbers", [](nb::handle self) {
-        const PyRecords& r = *nb::inst_ptr<PyRecords>(self);
-        return view(r.numbers, {5, r.records.ranks.size()}, self);
+    records.def_prop_ro("numbers", [](const PyRecords& self) {
+        const StepRecords& r = self.records;
+        std::vector<double> out;
+        for (const auto* values : {&r.ranks, &r.error_ratios, &r.placements, &r.held, &r.stiff})
+            out.insert(out.end(), values->begin(), values->end());
+        return owned_array(std::move(out), {5, r.ranks.size()});
     });
     records
         // Numbers of steps and of those with a zone, the least sigma, whether a stage kept the
@@ -1352,13 +1351,13 @@ void bind_run(nb::module_& m) {
                                                any(s.stiff));
                      })
         .def_prop_ro("break_count", [](const PyRecords& r) { return r.records.breaks.size(); })
-        // Whether dense output needs no more than the records: no breakpoint and no zone, and no
-        // step past a critical configuration.
+        // Whether dense output needs no more than the records: there are steps, but no breakpoint
+        // and no zone, and no step past a critical configuration.
         .def_prop_ro("plain",
                      [](const PyRecords& r) {
                          const StepRecords& s = r.records;
                          const auto& placed = s.placements;
-                         return s.breaks.empty() && s.zones.empty() &&
+                         return !s.ranks.empty() && s.breaks.empty() && s.zones.empty() &&
                                 std::count(placed.begin(), placed.end(), s.critical) == 0;
                      })
         .def_prop_ro("end_rate", [](const PyRecords& r) { return owned_array(r.end_rate); })
@@ -1487,13 +1486,13 @@ struct PySteps {
     }
 };
 
-// The steps of `records`, in the memory of these, of a run that ended at `end` (s): without
-// breakpoints, zones and layers.
-StepArrays arrays(const PyRecords& records, double end) {
+// The steps of plain `records`, in the memory of these, of a run that ended with the last of them or
+// at `stop` (s) in it: without breakpoints, zones and layers.
+StepArrays arrays(const PyRecords& records, std::optional<double> stop) {
     const StepRecords& r = records.records;
     StepArrays out;
     out.count = static_cast<long>(r.ranks.size());
-    out.end = end;
+    out.end = stop.value_or(r.times.back());
     out.width = static_cast<int>(records.stages);
     out.corrected = records.corrected > 0;
     out.times = r.times.data();
@@ -1521,15 +1520,15 @@ struct PyDense {
           nx(static_cast<std::size_t>(nq + nv)) {}
 
     PyDense(const std::vector<SchemeDense>& schemes, const DenseConstants& constants,
-            nb::object records_, double end)
-        : PyDense(schemes, constants, nb::cast<const PyRecords&>(records_), end) {
+            nb::object records_, std::optional<double> stop)
+        : PyDense(schemes, constants, nb::cast<const PyRecords&>(records_), stop) {
         records = std::move(records_);
     }
 
     PyDense(const std::vector<SchemeDense>& schemes, const DenseConstants& constants,
-            const PyRecords& from, double end)
+            const PyRecords& from, std::optional<double> stop)
         : dense(static_cast<int>(from.nx - from.n / 2), static_cast<int>(from.n / 2), schemes,
-                constants, arrays(from, end)),
+                constants, arrays(from, stop)),
           nx(from.nx) {
         const std::size_t stages = schemes[0].abscissae.size();
         if (stages != from.stages) throw nb::value_error("the records have another number of stages");
@@ -1566,13 +1565,14 @@ nb::object py_recorded_dips(const DipSearch& search, const Array& times, const A
     return nb::make_tuple(owned_array(std::move(found.t)), found.dips, found.tops);
 }
 
-// Whether the plain records of a run that ended at `end` (s) have no dips; false for stiff steps.
-bool without_dips(const DipSearch& search, const PyRecords& records, double end) {
-    const StepArrays steps = arrays(records, end);
+// Whether the plain records of a run have no dips; false for stiff steps.  `stop` as for arrays().
+bool without_dips(const DipSearch& search, const PyRecords& records, std::optional<double> stop) {
+    const StepArrays steps = arrays(records, stop);
     if (std::count(steps.stiff.begin(), steps.stiff.end(), 0) != steps.count) return false;
     const long width = static_cast<long>(records.stages);
     expect_within("columns", search.columns, 0, width - 1);
-    return recorded_dips(search, steps.times, steps.sigmas, steps.count, width, end).dips.empty();
+    return recorded_dips(search, steps.times, steps.sigmas, steps.count, width, steps.end)
+        .dips.empty();
 }
 
 // Of each step with sigma (n, abscissae) whether its stages lie close to a singular configuration.
@@ -1589,7 +1589,8 @@ std::vector<bool> py_close_to_singular(const std::vector<double>& abscissae, con
 
 void bind_dense_output(nb::module_& m) {
     m.def("recorded_dips", &py_recorded_dips);
-    m.def("without_dips", &without_dips);
+    m.def("without_dips", &without_dips, nb::arg("search"), nb::arg("records"),
+          nb::arg("stop").none());
     m.def("close_to_singular", &py_close_to_singular);
     bind_struct<PySteps>(m, "StepArrays");
     m.def("largest_norms", &largest_norms, nb::arg("x"), nb::arg("order"), nb::arg("starts"));
@@ -1598,8 +1599,9 @@ void bind_dense_output(nb::module_& m) {
                       const PySteps&>(),
              nb::arg("nq"), nb::arg("nv"), nb::arg("schemes"), nb::arg("constants"),
              nb::arg("steps"))
-        .def(nb::init<const std::vector<SchemeDense>&, const DenseConstants&, nb::object, double>(),
-             nb::arg("schemes"), nb::arg("constants"), nb::arg("records"), nb::arg("end"))
+        .def(nb::init<const std::vector<SchemeDense>&, const DenseConstants&, nb::object,
+                      std::optional<double>>(),
+             nb::arg("schemes"), nb::arg("constants"), nb::arg("records"), nb::arg("stop").none())
         .def("states", &PyDense::states)
         .def("between_ends", &PyDense::between_ends);
 }

@@ -17,6 +17,8 @@ namespace {
 constexpr double inf = std::numeric_limits<double>::infinity();
 // Attempts between two looks at the clock.
 constexpr long clock_every = 16;
+// Steps that records have room for at first, and the largest room for their rates (numbers).
+constexpr std::size_t first_steps = 64, first_rates = 1 << 14;
 }  // namespace
 
 void SmoothIntervals::check() const {
@@ -26,6 +28,15 @@ void SmoothIntervals::check() const {
     expect_size("given", given.size(), ends.size() - 1);
     if (!std::is_sorted(ends.begin(), ends.end()))
         throw std::invalid_argument("ends do not increase");
+}
+
+void StepRecords::reserve(const StepResult& r) {
+    for (auto* numbers : {&times, &ranks, &error_ratios, &placements, &stiff, &held})
+        numbers->reserve(first_steps);
+    states.reserve(first_steps * r.state.size());
+    corrections.reserve(first_steps * r.correction.size());
+    sigmas.reserve(first_steps * r.sigmas.size());
+    rates.reserve(std::min(first_steps * r.rates.size(), first_rates));
 }
 
 void StepRecords::append(const StepResult& r, double t_new, int placement) {
@@ -75,6 +86,7 @@ Run::Run(System& system, SplitStep step_, const ButcherTableau* stiff,
       singular_tolerance_(options.singular_tolerance),
       collocation_(options.collocation),
       one_freedom_(system.nv + (system.driven() ? 1 : 0) - system.structural_rank() == 1) {
+    records.reserve(step.result);
     enter_interval();
 }
 

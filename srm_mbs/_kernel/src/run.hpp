@@ -88,6 +88,8 @@ struct StepRecords {
     static constexpr int critical = 3;  // STEP_PLACEMENTS of dense_output.py
 
     long count() const { return static_cast<long>(times.size()); }
+    // Makes room for the first steps, of the sizes of `result`: short runs need no more.
+    void reserve(const StepResult& result);
     void append(const StepResult& result, double t_new, int placement);
     void clear();
 };

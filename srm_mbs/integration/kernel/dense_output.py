@@ -54,8 +54,8 @@ class CompiledDenseOutput(DenseOutput):
     made_by
         Backend of the run.
     recorded
-        Records of the kernel and the end (s) of the run, if they are all that is needed: the
-        steps, as arrays of Python, are then not read.
+        Records of the kernel and the time (s) of a terminal event or None, if they are all that is
+        needed: the steps, as arrays of Python, are then not read.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class CompiledDenseOutput(DenseOutput):
         steps: StepData | Callable[[], StepData],
         end_state: FloatArray | None = None,
         made_by: str = "kernel",
-        recorded: tuple[Any, float] | None = None,
+        recorded: tuple[Any, float | None] | None = None,
     ) -> None:
         super().__init__(system, scheme, steps, end_state)
         self._made_by = made_by

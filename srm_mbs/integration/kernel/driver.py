@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,13 +60,13 @@ class CompiledRecord(RunRecord):
         were repeated for it.
     """
 
-    run: Any = None
-    placed: int = 0
-    replaced: int = 0
-    _suspects: Sequence[float] = ()
-    _records: Any = None
+    run: Any
+    placed: int = field(default=0, init=False)
+    replaced: int = field(default=0, init=False)
+    _suspects: Sequence[float] = field(default=(), init=False)
+    _records: Any = field(default=None, init=False)
     """The steps, once the run is closed."""
-    _data: StepData | None = None
+    _data: StepData | None = field(default=None, init=False)
     """The same as arrays, once they were read."""
 
     def suspect_times(self) -> list[float]:
@@ -116,13 +116,10 @@ class CompiledRecord(RunRecord):
             self._data = steps_from(self._records, self.stop)
         return self._data
 
-    def recorded(self) -> tuple[Any, float] | None:
-        """Records and end (s) of the run, after :meth:`close`, if dense output needs no more."""
-        records = self._records
-        times = records.times
-        if len(times) < 2 or not records.plain:
-            return None
-        return records, float(times[-1]) if self.stop is None else self.stop
+    def recorded(self) -> tuple[Any, float | None] | None:
+        """Records of the run, and when (s) a terminal event ended it or None, after :meth:`close`;
+        None if dense output needs more."""
+        return (self._records, self.stop) if self._records.plain else None
 
 
 def integrate(
@@ -155,7 +152,7 @@ def integrate(
         Called whenever the kernel returns, which is at least every CHUNK seconds.
     """
     t_start, start = run.t0, run.start
-    record = CompiledRecord(run.t0, start, run=run)
+    record = CompiledRecord(run.t0, start, run)
     started = time.perf_counter()
     one_by_one = tick is not None or events is not None
     core = run.core

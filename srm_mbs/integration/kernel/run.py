@@ -177,7 +177,7 @@ class CompiledRun:
         singular_tolerance: float | None = None,
     ) -> None:
         self.kernel_system, self.method, self.norm = kernel_system, method, norm
-        self.start, self.t0, self.t_end = state.copy(), t0, float(intervals.ends[-1])
+        self.start, self.t0, self.t_end = state, t0, float(intervals.ends[-1])
         self.adaptive = step is None
         stiff = method.scheme.stiff
         options = marshalling.options_struct(

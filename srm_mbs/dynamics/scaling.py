@@ -25,7 +25,7 @@ from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.lazy import cached_property
-from srm_mbs.model.mechanism import MechanismData, per_model, per_tree
+from srm_mbs.model.mechanism import MechanismData, per_model, per_start, per_tree
 from srm_mbs.model.model_data import TreeNumbers, tree_numbers
 
 RELATIVE_ROUNDING = 1e-12
@@ -125,6 +125,69 @@ def periodic_coordinates(model: pin.Model) -> BoolArray:
         for i, component in moved:
             out[component] = turning[component] and data.liMi[i].isApprox(before[i], 1e-9)
     return out
+
+
+@per_tree
+def _measured_positions(mechanism: MechanismData) -> tuple[IndexArray, IndexArray]:
+    """Indices into q and into v of the positions that are numbers: coordinates of joints whose q is
+    a vector, and translations of planar and free joints, with which their q and v begin."""
+    angles = np.zeros(mechanism.model.nv, dtype=bool)
+    angles[rotating_coordinates(mechanism)] = True
+    in_q: list[int] = []
+    in_v: list[int] = []
+    for joint in mechanism.model.joints.tolist()[1:]:
+        own = angles[joint.idx_v : joint.idx_v + joint.nv]
+        count = joint.nv if joint.nq == joint.nv else int(np.logical_and.accumulate(~own).sum())
+        in_q += range(joint.idx_q, joint.idx_q + count)
+        in_v += range(joint.idx_v, joint.idx_v + count)
+    return np.array(in_q, dtype=int), np.array(in_v, dtype=int)
+
+
+class PositionRounding(NamedTuple):
+    """How closely the positions of a configuration are known.
+
+    Attributes
+    ----------
+    relative
+        The largest distance of a position from the next floating-point number, over its unit.
+    coordinate
+        The velocity index of that position; -1 without positions that are numbers.
+    position
+        That position itself, in rad or m.
+    """
+
+    relative: float
+    coordinate: int
+    position: float
+
+    @property
+    def absolute(self) -> float:
+        """The distance itself, in rad or m."""
+        return float(np.spacing(abs(self.position)))
+
+
+def position_rounding(mechanism: MechanismData, q: FloatArray) -> PositionRounding:
+    """The rounding of the positions q (nq,), in the units at the start of ``mechanism``."""
+    in_q, in_v = _measured_positions(mechanism)
+    if not len(in_q):
+        return PositionRounding(0.0, -1, 0.0)
+    relative = np.spacing(np.abs(q[in_q])) / _measured_units(mechanism)
+    worst = int(relative.argmax())
+    return PositionRounding(float(relative[worst]), int(in_v[worst]), float(q[in_q[worst]]))
+
+
+@per_start
+def _measured_units(mechanism: MechanismData) -> FloatArray:
+    """Units of the :func:`_measured_positions`."""
+    unit = coordinate_units(mechanism, mechanism.q0, mechanism.v0).coordinate
+    own: FloatArray = unit[_measured_positions(mechanism)[1]]
+    return own
+
+
+@per_start
+def start_rounding(mechanism: MechanismData) -> PositionRounding:
+    """:func:`position_rounding` of the initial positions."""
+    return position_rounding(mechanism, mechanism.q0)
 
 
 def row_dimensions(mechanism: MechanismData) -> tuple[str, ...]:

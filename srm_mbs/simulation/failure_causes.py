@@ -1,5 +1,5 @@
-"""Causes of failures that a reader can act on: unstable sampled controllers, and drives at their
-dead points.
+"""Causes of failures that a reader can act on: unstable sampled controllers, drives at their dead
+points, and starts at positions so large that their rounding exceeds what closures are held to.
 
 A run fails where its steps fail, and says so; these causes come first in its message.
 """
@@ -12,7 +12,12 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import ChartPoint, TangentChart, tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.scaling import is_angle
+from srm_mbs.dynamics.scaling import (
+    PositionRounding,
+    is_angle,
+    rotating_coordinates,
+    start_rounding,
+)
 from srm_mbs.errors import ControllerError, safe_repr
 from srm_mbs.integration.messages import FailureCause
 from srm_mbs.model.coordinates import free_coordinates, joint_coordinates, position_of
@@ -32,6 +37,9 @@ SLOPE_STEP = 1e-4
 """Step of the difference for the second derivative of a coordinate along the motion."""
 FLAT = 1e-9
 """Slope of a coordinate along the motion that is zero."""
+COARSE = 1e-10
+"""Rounding of a position, over its unit, from which it may be what a run fails by: a hundred times
+the largest closure error of a start."""
 
 
 class HeldForceWatch:
@@ -181,10 +189,33 @@ def _dead_point_of(
     )
 
 
+def rounding_clause(mechanism: Mechanism, rounding: PositionRounding) -> str:
+    """Which initial position is known how closely, as a clause."""
+    name = _joint_of(mechanism, rounding.coordinate)
+    turning = rounding.coordinate in rotating_coordinates(mechanism)
+    unit = "rad" if turning else "m"
+    return (
+        f"the joint {safe_repr(name)} starts at {rounding.position:.3g} {unit}, known to "
+        f"{rounding.absolute:.1g} {unit}"
+    )
+
+
+def coarse_start(mechanism: Mechanism) -> FailureCause | None:
+    """An initial position whose rounding is beyond what closures and drives are held to; None if
+    there is none."""
+    rounding = start_rounding(mechanism)
+    if not (mechanism.constrained and rounding.relative > COARSE):
+        return None
+    return FailureCause(
+        f"rounding limits how well the loops close: {rounding_clause(mechanism, rounding)}",
+        "Start within a few turns of zero and next to the origin, or take a larger rtol",
+    )
+
+
 def failure_cause(
     mechanism: Mechanism, t: float, q: FloatArray, watch: HeldForceWatch | None
 ) -> FailureCause | None:
     """The cause of a failure at ``t`` (s) and ``q`` (nq,), under the forces that ``watch`` saw;
     None if it is none of those that are known."""
     cause = None if watch is None else watch.cause()
-    return dead_point(mechanism, t, q) if cause is None else cause
+    return cause or dead_point(mechanism, t, q) or coarse_start(mechanism)

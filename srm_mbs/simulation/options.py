@@ -250,7 +250,7 @@ def loosest_rtol(method: Method) -> float:
 
 def tightest_rtol(scheme: ButcherTableau, constrained: bool) -> float:
     """The tightest rtol that rounding leaves ``scheme``, of mechanisms ``constrained`` by closures
-    or drives and of others."""
+    or drives and of others, whose positions are of the order of their units."""
     if not constrained:
         return float(TIGHTEST_RTOL)
     order = scheme.controller_order or 1

@@ -21,7 +21,12 @@ from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_control
 from srm_mbs.dynamics.forces import over_half_turn
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
-from srm_mbs.dynamics.scaling import Units, constraint_units
+from srm_mbs.dynamics.scaling import (
+    Units,
+    constraint_units,
+    position_rounding,
+    start_rounding,
+)
 from srm_mbs.dynamics.system import System
 from srm_mbs.errors import (
     ControllerError,
@@ -30,6 +35,7 @@ from srm_mbs.errors import (
     InputError,
     SimulationError,
     safe_repr,
+    warn,
 )
 from srm_mbs.integration import driver
 from srm_mbs.integration.breakpoints import BreakpointHandler, SmoothIntervals, smooth_intervals
@@ -76,7 +82,8 @@ from srm_mbs.integration.singular_passages import (
 from srm_mbs.model.forces import LimitSpring
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import per_model, per_start, per_tree
-from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
+from srm_mbs.model.numbers import finite_array
+from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause, rounding_clause
 from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
 from srm_mbs.simulation.options import (
     RunOptions,
@@ -321,6 +328,25 @@ def checked_options(mechanism: Any, options: RunOptions) -> RunOptions:
         For the first that is invalid.
     """
     check_mechanism(mechanism)
+    return above_rounding(mechanism, _checked(mechanism, options))
+
+
+def above_rounding(mechanism: Mechanism, options: RunOptions) -> RunOptions:
+    """Checked ``options`` with an rtol that the rounding of the initial positions allows; warns
+    where it is changed."""
+    # Invalid positions are refused elsewhere.
+    given = None if options.q0 is None else finite_array(options.q0, (mechanism.model.nq,))
+    rounding = start_rounding(mechanism) if given is None else position_rounding(mechanism, given)
+    if options.step is not None or options.rtol >= rounding.relative:
+        return options
+    warn(
+        f"rtol = {options.rtol:g} is below the rounding of the initial positions "
+        f"({rounding_clause(mechanism, rounding)}): using {rounding.relative:.1e}"
+    )
+    return options._replace(rtol=rounding.relative)
+
+
+def _checked(mechanism: Mechanism, options: RunOptions) -> RunOptions:
     # Most runs of a loop have the same options, of which those without functions and arrays are
     # known by their values and types: 1 is no truth value, and True no number.
     others = options[:2] + options[4:]  # without the start, which is checked elsewhere

@@ -39,6 +39,7 @@ from srm_mbs.simulation.options import (
 )
 from srm_mbs.simulation.result import Statistics
 from srm_mbs.simulation.runner import (
+    above_rounding,
     check_consistent,
     checked_accuracy,
     error_norm,
@@ -100,6 +101,7 @@ class Simulator:
         del given["self"], given["mechanism"]
         check_mechanism(mechanism)
         options = checked_accuracy(mechanism, RunOptions(math.inf, **given), 0.0, math.inf)
+        options = above_rounding(mechanism, options)
         check_embedded(options.method.scheme, step)
         check_consistent(mechanism)
         self._mechanism, self._options = mechanism, options

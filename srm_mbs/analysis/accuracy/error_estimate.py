@@ -17,7 +17,7 @@ import numpy as np
 from srm_mbs._typing import BoolArray, FloatArray
 from srm_mbs.analysis.accuracy.samples import Samples, sample_states, sample_times
 from srm_mbs.dynamics.observables import NO_ANGLES
-from srm_mbs.dynamics.scaling import angle_coordinates, position_rounding
+from srm_mbs.dynamics.scaling import angle_coordinates, start_rounding
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.model.mechanism import MechanismData, per_model
@@ -220,7 +220,7 @@ def checked_settings(solution: SimulationResult, rtol: float | None) -> list[flo
             )
         return [settings.step / 2.0, settings.step / 4.0]
     # By default no tolerance is so tight that rounding dominates.
-    rounding = position_rounding(solution.mechanism, solution.q[0]).relative
+    rounding = start_rounding(solution.mechanism).relative
     tightest = max(tightest_rtol(solution.scheme, True), rounding)
     other = (
         max(TIGHTEST_RATIO * settings.rtol, tightest) if rtol is None else positive(rtol, "rtol")

@@ -351,7 +351,7 @@ class SingularityPlacement(ControlWrapper):
             h = self._placed(self._zero - t, proposal.h, t)
             if h != proposal.h:
                 self.placed += 1
-                return Proposal(h, t + h, placed=True)
+                return Proposal.over(t, h, placed=True)
         return proposal
 
     def set_target_time(self, end: float, grid: Grid | None = None) -> None:

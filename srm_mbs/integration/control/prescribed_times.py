@@ -84,7 +84,7 @@ class AvoidTimes(ControlWrapper):
         if self._step is not None and self._end_blocked(longest, distances):
             longest = min(self._step, limit, self._t_end - t)
         h = self._longest_clear(longest, distances)
-        return Proposal(h, t + h)
+        return Proposal.over(t, h)
 
     def _clear(self, h: float, distances: FloatArray) -> bool:
         """Whether a step of length ``h`` stays clear of times at ``distances`` (s)."""

@@ -6,6 +6,7 @@ The decision on a step is separate from making it.  One control may wrap another
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
@@ -34,6 +35,8 @@ PROBE_LENGTH = 0.01
 by itself; the change that the first step may make."""
 LONGEST_FIRST = 100.0
 """Longest first step, over that probe."""
+CLOCK_ROUNDING = 1e-10
+"""Rounding of the time at the end of a step, over the length of the step, from which it counts."""
 UNEVALUATED_ERROR_RATIO = 1e6
 """Error ratio of a step whose stages could not be evaluated or are not finite."""
 
@@ -69,6 +72,18 @@ class Proposal:
     t_new: float
     placed: bool = False
     singular_arrival: bool = False
+
+    @classmethod
+    def over(cls, t: float, h: float, placed: bool = False) -> Proposal:
+        """A step from ``t`` (s) of about the length ``h`` (s).
+
+        Times far from zero are coarse: the motion is to advance by what the clock does, or the
+        errors of many steps add up.
+        """
+        t_new = t + h
+        if math.ulp(t_new) > CLOCK_ROUNDING * h:
+            h = t_new - t
+        return cls(h, t_new, placed)
 
 
 class StepSizeControl(Protocol):
@@ -149,7 +164,7 @@ def _until(t: float, h: float, end: float) -> Proposal:
         return Proposal(remaining, end)
     if 2.0 * h > remaining:
         h = 0.5 * remaining
-    return Proposal(h, t + h)
+    return Proposal.over(t, h)
 
 
 class PIControl:
@@ -246,7 +261,7 @@ class FixedStep:
         if target > self._t_end - 1e-9 * self._step:
             target = self._t_end
         if limit < target - t:
-            return Proposal(limit, t + limit)
+            return Proposal.over(t, limit)
         return Proposal(target - t, target)
 
     def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:

@@ -47,7 +47,7 @@ class HalvedStep(SlopeOfSigma):
         # Less than the whole step may be left; a sliver must not be.
         if h > remaining * (1.0 - 1e-9):
             return Proposal(remaining, self._t_end)
-        return Proposal(h, t + h)
+        return Proposal.over(t, h)
 
     def decide(self, proposal: Proposal, result: StepResult | None) -> StepDecision:
         """Replace a step that ends on a singular point; otherwise the inner decision."""

@@ -19,6 +19,7 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.scaling import vector_coordinates
 from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_tree
@@ -146,16 +147,6 @@ def _groups(mechanism: MechanismData) -> tuple[GroupJoint, ...]:
 
 
 @per_tree
-def _vector_coordinates(mechanism: MechanismData) -> IndexArray:
-    """Index into q of each velocity component (nv,), -1 where q is not a vector space there."""
-    index = np.full(mechanism.model.nv, -1)
-    for joint in mechanism.model.joints.tolist()[1:]:
-        if joint.nq == joint.nv:
-            index[joint.idx_v : joint.idx_v + joint.nv] = range(joint.idx_q, joint.idx_q + joint.nq)
-    return index
-
-
-@per_tree
 def _angle_pairs(mechanism: MechanismData) -> IndexArray:
     """Velocity indices of the joints whose angle is (cos, sin)."""
     joints = mechanism.model.joints.tolist()[1:]
@@ -166,7 +157,7 @@ def _angle_pairs(mechanism: MechanismData) -> IndexArray:
 def _chart_constants(mechanism: MechanismData) -> dict[str, Any]:
     groups = _groups(mechanism)
     return {
-        "position_of": _vector_coordinates(mechanism).tolist(),
+        "position_of": vector_coordinates(mechanism).tolist(),
         "groups": [(j.group, j.start, j.size, j.position) for j in groups],
         "series": np.array(SERIES),
         "wrapped_angles": _angle_pairs(mechanism).tolist(),
@@ -203,7 +194,7 @@ class Manifold:
 
     @cached_property
     def _position_of(self) -> IndexArray:
-        return _vector_coordinates(self.mechanism)
+        return vector_coordinates(self.mechanism)
 
     @cached_property
     def _largest_scale(self) -> FloatArray:

@@ -128,32 +128,26 @@ def periodic_coordinates(model: pin.Model) -> BoolArray:
 
 
 @per_tree
-def _measured_positions(mechanism: MechanismData) -> tuple[IndexArray, IndexArray]:
-    """Indices into q and into v of the positions that are numbers: coordinates of joints whose q is
-    a vector, and translations of planar and free joints, with which their q and v begin."""
-    angles = np.zeros(mechanism.model.nv, dtype=bool)
-    angles[rotating_coordinates(mechanism)] = True
-    in_q: list[int] = []
-    in_v: list[int] = []
+def vector_coordinates(mechanism: MechanismData) -> IndexArray:
+    """Index into q of each velocity component (nv,), -1 where q is not a vector space there."""
+    index = np.full(mechanism.model.nv, -1)
     for joint in mechanism.model.joints.tolist()[1:]:
-        own = angles[joint.idx_v : joint.idx_v + joint.nv]
-        count = joint.nv if joint.nq == joint.nv else int(np.logical_and.accumulate(~own).sum())
-        in_q += range(joint.idx_q, joint.idx_q + count)
-        in_v += range(joint.idx_v, joint.idx_v + count)
-    return np.array(in_q, dtype=int), np.array(in_v, dtype=int)
+        if joint.nq == joint.nv:
+            index[joint.idx_v : joint.idx_v + joint.nv] = range(joint.idx_q, joint.idx_q + joint.nq)
+    return index
 
 
 class PositionRounding(NamedTuple):
-    """How closely the positions of a configuration are known.
+    """How closely the joint coordinates of a configuration are known.
 
     Attributes
     ----------
     relative
-        The largest distance of a position from the next floating-point number, over its unit.
+        The largest distance of a coordinate from the next floating-point number, over its unit.
     coordinate
-        The velocity index of that position; -1 without positions that are numbers.
+        Its velocity index; -1 without coordinates that are numbers.
     position
-        That position itself, in rad or m.
+        The coordinate itself, in rad or m.
     """
 
     relative: float
@@ -167,21 +161,30 @@ class PositionRounding(NamedTuple):
 
 
 def position_rounding(mechanism: MechanismData, q: FloatArray) -> PositionRounding:
-    """The rounding of the positions q (nq,), in the units at the start of ``mechanism``."""
-    in_q, in_v = _measured_positions(mechanism)
+    """The rounding of the :func:`vector_coordinates` of q (nq,), in the units at the start of
+    ``mechanism``.
+
+    Those of planar and free joints do not count: where a body is that hangs on nothing does not
+    change how it moves.
+    """
+    in_q, in_v, unit = _scalars(mechanism)
     if not len(in_q):
         return PositionRounding(0.0, -1, 0.0)
-    relative = np.spacing(np.abs(q[in_q])) / _measured_units(mechanism)
+    relative = np.spacing(np.abs(q[in_q])) / unit
     worst = int(relative.argmax())
     return PositionRounding(float(relative[worst]), int(in_v[worst]), float(q[in_q[worst]]))
 
 
 @per_start
-def _measured_units(mechanism: MechanismData) -> FloatArray:
-    """Units of the :func:`_measured_positions`."""
-    unit = coordinate_units(mechanism, mechanism.q0, mechanism.v0).coordinate
-    own: FloatArray = unit[_measured_positions(mechanism)[1]]
-    return own
+def _scalars(mechanism: MechanismData) -> tuple[IndexArray, IndexArray, FloatArray]:
+    """Indices into q and into v of the :func:`vector_coordinates`, and their units."""
+    place = vector_coordinates(mechanism)
+    in_v = np.flatnonzero(place >= 0)
+    return (
+        place[in_v],
+        in_v,
+        coordinate_units(mechanism, mechanism.q0, mechanism.v0).coordinate[in_v],
+    )
 
 
 @per_start

@@ -88,27 +88,43 @@ def test_a_failure_names_the_rounding_of_a_start_that_closures_do_not_bear(
         assert "the joint 'crank' starts at 6.28e+06 rad, known to 9e-10 rad" in cause.clause
 
 
-def floating_ball() -> srm.Mechanism:
-    """A ball joint on a floating body, beside a planar joint."""
+def floating() -> srm.Mechanism:
+    """A floating body with a ball joint and a slide on it, beside a planar joint."""
     model = pin.Model()
     body = pin.Inertia.FromSphere(1.0, 0.5)
     base = add_link(model, 0, pin.JointModelFreeFlyer(), "base", body, pin.SE3.Identity())
-    add_link(model, base, pin.JointModelSpherical(), "ball", body, pin.SE3.Identity())
+    ball = add_link(model, base, pin.JointModelSpherical(), "ball", body, pin.SE3.Identity())
+    add_link(model, ball, pin.JointModelPX(), "slide", body, pin.SE3.Identity())
     add_link(model, 0, pin.JointModelPlanar(), "table", body, pin.SE3.Identity())
     return srm.Mechanism(model)
 
 
-@pytest.mark.parametrize(("place", "coordinate"), [(2, 2), (12, 10), (5, None), (9, None)])
-def test_positions_that_are_numbers_have_a_rounding_and_rotations_have_none(
-    place: int, coordinate: int | None
-) -> None:
-    mechanism = floating_ball()
+@pytest.mark.parametrize("place", [2, 5, 9, 12])
+def test_the_place_of_a_free_body_and_rotations_have_no_rounding_that_counts(place: int) -> None:
+    mechanism = floating()
     q = np.zeros(mechanism.model.nq)
     q[place] = 1e9
-    rounding = position_rounding(mechanism, q)
+    assert position_rounding(mechanism, q).relative < 1e-300
+
+
+def test_the_rounding_of_a_slide_is_relative_to_the_size_of_the_mechanism() -> None:
+    mechanism = floating()
+    q = np.zeros(mechanism.model.nq)
+    q[11] = -1e9
     length = mechanism.structure.units.length
-    if coordinate is None:
-        assert rounding.relative < 1e-300
-    else:
-        assert rounding == (np.spacing(1e9) / length, coordinate, 1e9)
-        assert rounding.absolute == np.spacing(1e9)
+    rounding = position_rounding(mechanism, q)
+    assert rounding == (np.spacing(1e9) / length, 9, -1e9)
+    assert rounding.absolute == np.spacing(1e9)
+
+
+def test_mechanisms_without_joint_coordinates_have_no_rounding() -> None:
+    model = pin.Model()
+    add_link(
+        model,
+        0,
+        pin.JointModelSpherical(),
+        "ball",
+        pin.Inertia.FromSphere(1.0, 0.5),
+        pin.SE3.Identity(),
+    )
+    assert finished(srm.Mechanism(model), 0.1, rtol=1e-13).settings.rtol == 1e-13

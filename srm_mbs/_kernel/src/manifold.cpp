@@ -32,7 +32,7 @@ Eigen::LLT<Matrix, Eigen::Upper> factors_of(const double* M, int nv, int first, 
 
 void System::rows_and_mass(const double* q, double* G) {
     auto& w = *work_;
-    std::copy(q, q + nq, w.q.data());
+    w.place(q);
     w.v.setZero();
     pinocchio_model::compute_terms(w);
     update_closures(q, false);

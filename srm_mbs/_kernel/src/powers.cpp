@@ -63,7 +63,7 @@ void System::powers(const double* t, const double* states, std::size_t n,
     };
     for (std::size_t i = 0; i < n; ++i, states += nq + nv) {
         const double* const v = states + nq;
-        std::copy(states, v, w.q.data());
+        w.place(states);
         if (resting) w.v.setZero();
         else std::copy(v, v + nv, w.v.data());
         // Bodies that move tell the power of a wrench, which takes no Jacobian.

@@ -121,7 +121,7 @@ void System::reactions(double t, const double* state, System& all, const double*
     }
     const double* const q = state;
     const double* const v = state + nq;
-    std::copy(q, q + nq, w.q.data());
+    w.place(q);
     std::copy(v, v + nv, w.v.data());
     std::copy(rate.begin() + nv, rate.end(), w.tau.data());
     pinocchio::rnea(w.model, w.data, Argument(w.q), Argument(w.v), Argument(w.tau));

@@ -746,7 +746,7 @@ void System::generated_terms(double t, const double* state, ForceLaws* laws) {
 
 void System::tree_terms(const double* state) {
     auto& w = *work_;
-    std::copy(state, state + nq, w.q.data());
+    w.place(state);
     std::copy(state + nq, state + nq + nv, w.v.data());
     if (code_)
         generated_terms(0.0, state, nullptr);
@@ -805,7 +805,7 @@ bool System::derivatives(const double* state, const double* a, double* by_forces
         N.resize(nv, rank());
         projection_->normals(N.data());
     }
-    std::copy(state, state + nq, w.q.data());
+    w.place(state);
     std::copy(state + nq, state + nq + nv, w.v.data());
     std::copy(a, a + nv, w.tau.data());
     pinocchio::computeRNEADerivatives(w.model, w.data, Argument(w.q), Argument(w.v),
@@ -976,7 +976,7 @@ void System::evaluate(double t, const double* state, const ZoneView& zone) {
     t = std::clamp(t, first_, last_);
     if (!(distance(state, nq + nv) < overflow)) throw EvaluationError{Failure::not_finite};
     auto& w = *work_;
-    std::copy(state, state + nq, w.q.data());
+    w.place(state);
     std::copy(state + nq, state + nq + nv, w.v.data());
     coordinate_forces(t, state);
     ForceLaws* const laws = tracks_laws_ ? &laws_ : nullptr;
@@ -1103,7 +1103,7 @@ void System::free_acceleration(double* out) {
 
 void System::impulse_response(const double* q, const double* n, double* along, double* free) {
     auto& w = *work_;
-    std::copy(q, q + nq, w.q.data());
+    w.place(q);
     w.v.setZero();
     pinocchio_model::compute_terms(w);
     update_closures(q, false);
@@ -1394,7 +1394,7 @@ double System::step_limit(const double* state) const {
 
 void System::move_bodies(const double* state) {
     auto& w = *work_;
-    std::copy(state, state + nq, w.q.data());
+    w.place(state);
     std::copy(state + nq, state + nq + nv, w.v.data());
     pinocchio_model::move_bodies(w);
 }
@@ -1419,7 +1419,7 @@ double System::past_jump(double t, const double* state) {
 double System::closure_residual_at(double t, const double* state) {
     if (!closed_) return 0.0;
     auto& w = *work_;
-    std::copy(state, state + nq, w.q.data());
+    w.place(state);
     pinocchio::crba(w.model, w.data, Argument(w.q), pinocchio::Convention::WORLD);
     update_closures(state, false);
     update_drives(t, false);
@@ -1532,7 +1532,7 @@ void System::closures_at(double t, const double* q, double* g, double* G, int wi
 void System::write_rows(double t, const double* q, double* G, int width) {
     auto& w = *work_;
     t = std::clamp(t, first_, last_);
-    std::copy(q, q + nq, w.q.data());
+    w.place(q);
     pinocchio::computeJointJacobians(w.model, w.data, Argument(w.q));
     update_closures(q, false);
     update_drives(t, false);

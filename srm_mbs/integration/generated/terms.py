@@ -81,10 +81,12 @@ class Place(NamedTuple):
     rotation: Matrix
     origin: Vector
     base: Vector
+    own: Vector
+    """Where on the body its origin is."""
 
     def point(self, local: Vector) -> Vector:
         """The place of a point of the body."""
-        return add(self.origin, times(self.rotation, local))
+        return add(self.origin, times(self.rotation, subtract(local, self.own)))
 
 
 class Body(NamedTuple):
@@ -356,17 +358,17 @@ class Trace:
         origin of the world: every tree has a base.
         """
         motions = self.structure.motions
-        out = {frame: Place(self.units, self.nothing, self.nothing)}
+        out = {frame: Place(self.units, self.nothing, self.nothing, self.nothing)}
         number = frame
         while number >= 0:
-            motion, (rotation, origin, _) = motions[number], out[number]
+            motion, (rotation, origin, _, _) = motions[number], out[number]
             placed, at = self.placement(motion.placement)
             turned, moved, _ = self.joints[number]
             before = product(rotation, transposed(turned))
             above = product(before, transposed(placed))
-            way = add(times(above, add(self.base(motion), at)), times(before, moved))
+            way = add(times(above, at), times(before, moved))
             number = motion.parent
-            out[number] = Place(above, subtract(origin, way), self.nothing)
+            out[number] = Place(above, subtract(origin, way), self.nothing, self.base(motion))
         for number, motion in enumerate(motions):
             if number not in out:
                 parent = out[motion.parent]
@@ -374,12 +376,15 @@ class Trace:
                 turned, moved, _ = self.joints[number]
                 before = product(parent.rotation, placed)
                 base = parent.base
+                way = times(before, moved)
                 if motion.parent < 0 and frame == GROUND:
                     base = self.base(motion)
+                    if motion.base.length and motion.kind in ("free", "planar"):
+                        base, way = add(base, way), self.nothing
                 else:
                     at = add(self.base(motion), at)
-                origin = add(parent.point(at), times(before, moved))
-                out[number] = Place(product(before, turned), origin, base)
+                origin = add(parent.point(at), way)
+                out[number] = Place(product(before, turned), origin, base, self.nothing)
         return out
 
     def _move(self, number: int, motion: Motion) -> None:
@@ -387,7 +392,7 @@ class Trace:
         parent = self.ground if motion.parent < 0 else self.bodies[motion.parent]
         self.roots.append(number if motion.parent < 0 else self.roots[motion.parent])
         place = self.places[number]
-        rotation, origin, base = place
+        rotation, origin, base, _ = place
         own = []
         linear, angular, ahead = self.nothing, self.nothing, self.nothing
         _, _, subspace = self.joints[number]

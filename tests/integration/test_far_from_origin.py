@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.observables import Observables
 from srm_mbs.integration.kernel import backend as kernel
 from srm_mbs.integration.kernel.observables import CompiledObservables
-from tests.support.bundled import finished, load
+from tests.support.bundled import finished, load, rewritten
 
 pytestmark = pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
 
@@ -64,6 +65,25 @@ def test_passages_one_kilometre_away_are_those_near_the_origin(backend: str, rto
     assert len(own.crossings) == len(far.crossings) > 2
     np.testing.assert_array_equal(far.q, own.q)
     assert far.stats.evaluations == own.stats.evaluations
+
+
+@pytest.mark.parametrize("backend", ["kernel", "generated"])
+def test_passages_on_a_body_ten_kilometres_away_are_those_near_the_origin(
+    backend: str, tmp_path: Path
+) -> None:
+    free = ('base = "fixed"', 'base = "floating"')
+    body = ('"world"', '"body"')
+    mechanism = srm.load(rewritten(tmp_path, "n_four_bar_2", free, urdf=(body,)))
+    runs = []
+    for away in (np.zeros(3), 10.0 * FAR):
+        q = mechanism.q0.copy()
+        q[:3] += away
+        runs.append(finished(mechanism, 3.0, q0=q, rtol=1e-9, backend=backend))
+    here, far = runs
+    assert len(here.crossings) == len(far.crossings) > 0
+    np.testing.assert_allclose(far.q[-1, 3:], here.q[-1, 3:], rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(far.q[-1, :3] - 10.0 * FAR, here.q[-1, :3], rtol=0.0, atol=1e-9)
+    assert far.stats.evaluations < 1.1 * here.stats.evaluations
 
 
 def forced() -> srm.Mechanism:

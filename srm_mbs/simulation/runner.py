@@ -337,7 +337,8 @@ def above_rounding(mechanism: Mechanism, options: RunOptions) -> RunOptions:
     # Invalid positions are refused elsewhere.
     given = None if options.q0 is None else finite_array(options.q0, (mechanism.model.nq,))
     rounding = start_rounding(mechanism) if given is None else position_rounding(mechanism, given)
-    if options.step is not None or options.rtol >= rounding.relative:
+    constrained = mechanism.constrained  # the closures magnify it
+    if options.step is not None or not constrained or options.rtol >= rounding.relative:
         return options
     warn(
         f"rtol = {options.rtol:g} is below the rounding of the initial positions "

@@ -575,9 +575,10 @@ class LoopKinematics:
         for rows in own:
             rows.count_from(bases)
         # Wrenches about the base of b: its moments are those about a's and apart x force.
-        turns = [pin.skew(np.array(rows.apart)) for rows in own for _ in range(rows.count)]
-        self._to_b = np.tile(np.eye(6), (len(turns), 1, 1))
-        self._to_b[:, 3:, :3] = np.array(turns).reshape(-1, 3, 3)
+        self._to_b = np.tile(np.eye(6), (self._anchored, 1, 1))
+        for rows in own:
+            turn = pin.skew(np.array(rows.apart))
+            self._to_b[rows.first_row : rows.first_row + rows.count, 3:, :3] = turn
         self._of_b = self._support[: self._anchored] < 0.0
         return self
 

@@ -189,7 +189,9 @@ def test_its_terms_are_the_dense_ones_where_all_rows_share_the_coordinates_of_on
     for x in states(mechanism, 5):
         found = sparse.terms(0.0, x)
         alike(found, dense.terms(0.0, x), same_pivots=False)
-        alike(found, reference_terms(system, x))
+        # Where the body is does not count; the reference has the rounding of its place.
+        at_origin = np.concatenate([np.zeros(3), x[3:]])
+        alike(found, reference_terms(system, at_origin))
 
 
 @pytest.mark.parametrize("n", [3, 10, 40, 100])

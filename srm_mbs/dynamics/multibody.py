@@ -230,13 +230,6 @@ def _constants(mechanism: Mechanism) -> dict[str, Any]:
     return {}
 
 
-@per_model
-def _resistance(mechanism: Mechanism) -> tuple[FloatArray, FloatArray, bool, bool]:
-    """Damping and friction (nv,) of the joints, and whether there are any."""
-    damping, friction = mechanism.model.damping.copy(), mechanism.model.friction.copy()
-    return damping, friction, bool(damping.any()), bool(friction.any())
-
-
 class Mechanics(Manifold):
     """Applied forces, energy and constants of a mechanism and its controller, open or closed."""
 
@@ -252,7 +245,11 @@ class Mechanics(Manifold):
         self.multiplier_size = self.nv
         self.evaluations = 0
         self._controller = controller
-        self._damping, self._friction, self.is_damped, self.has_friction = _resistance(mechanism)
+        self._damping: FloatArray = self.model.damping.copy()
+        self._friction: FloatArray = self.model.friction.copy()
+        # Of a list, because any() of a short array costs five times as much.
+        self.is_damped = any(self._damping.tolist())
+        self.has_friction = any(self._friction.tolist())
         self._is_loaded = self.is_damped or self.has_friction or controller is not None
         self.friction_speed = mechanism.friction_speed
         self._forces = resolved_forces(mechanism)
@@ -495,8 +492,7 @@ class Mechanics(Manifold):
         return known | self.constants_of_start()
 
     def constants_of_start(self) -> dict[str, Any]:
-        """Those among :meth:`constants` that depend on the start, or that variants with the same
-        rows have of their own."""
+        """Those among :meth:`constants` that depend on the start, or that the model may change."""
         return {
             "unit": self._unit,
             "residual_scale": self.residual_scale,
@@ -636,7 +632,7 @@ class ClosedSystem(Mechanics):
         return trees_of(self.model) if rows_in_use(self.mechanism).anchors() else None
 
     @cached_property
-    def _tree(self) -> tuple[pin.Model, pin.Data]:
+    def _of_closures(self) -> tuple[pin.Model, pin.Data]:
         """Model and workspace of the closures; forces of elements have places in the world."""
         trees = self._trees
         return (self.model, self.data) if trees is None else (trees.model, workspace(self.model))
@@ -648,7 +644,7 @@ class ClosedSystem(Mechanics):
     @cached_property
     def _mass_matrix(self) -> FloatArray:
         """View (nv, nv) of what crba writes: finding it takes as long as a solve."""
-        return self._tree[1].M  # type: ignore[no-any-return]
+        return self._of_closures[1].M  # type: ignore[no-any-return]
 
     @cached_property
     def _joined(self) -> ForceKinematics | None:
@@ -738,7 +734,7 @@ class ClosedSystem(Mechanics):
         if not blas.dasum(state) < _OVERFLOW:
             raise EvaluationError("the state is not finite, or overflows")
         t = min(max(t, self._first), self._last)
-        (model, data), nq = self._tree, self.nq
+        (model, data), nq = self._of_closures, self.nq
         q, v = state[:nq], state[nq:]
         pin.crba(model, data, q, _WORLD)
         f = -pin.nonLinearEffects(model, data, q, v)
@@ -788,7 +784,7 @@ class ClosedSystem(Mechanics):
             As :meth:`evaluate`.
         """
         loops, p = self.loops, self.projection
-        loops.evaluate(*self._tree, q)
+        loops.evaluate(*self._of_closures, q)
         p.factor(self._mass_matrix, loops.G, n, np.zeros(len(loops.g)), None)
         white = p.white_force
         return p.unwhiten(white), p.unwhiten(white - p.Q @ (p.Q.T @ white))
@@ -812,7 +808,7 @@ class ClosedSystem(Mechanics):
         """Scaled g - s (m,) and G v - s' (m,) of the kept rows at the time t (s)."""
         q, v = self.split(state)
         rows = self.loops
-        rows.evaluate(*self._tree, q)
+        rows.evaluate(*self._of_closures, q)
         rows.move_to(t)
         return rows.g.copy(), rows.G @ v - rows.target_rate
 

@@ -334,11 +334,12 @@ def checked_options(mechanism: Any, options: RunOptions) -> RunOptions:
 def above_rounding(mechanism: Mechanism, options: RunOptions) -> RunOptions:
     """Checked ``options`` with an rtol that the rounding of the initial positions allows; warns
     where it is changed."""
+    if options.step is not None or not mechanism.constrained:  # closures magnify it
+        return options
     # Invalid positions are refused elsewhere.
     given = None if options.q0 is None else finite_array(options.q0, (mechanism.model.nq,))
     rounding = start_rounding(mechanism) if given is None else position_rounding(mechanism, given)
-    constrained = mechanism.constrained  # the closures magnify it
-    if options.step is not None or not constrained or options.rtol >= rounding.relative:
+    if options.rtol >= rounding.relative:
         return options
     warn(
         f"rtol = {options.rtol:g} is below the rounding of the initial positions "

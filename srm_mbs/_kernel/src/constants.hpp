@@ -75,6 +75,7 @@ namespace srm {
     field(double, rate_overflow)           /* rates from which products may overflow */            \
     field(double, first_step_probe)        /* relative change that the first step may make */      \
     field(double, longest_first_step)      /* over the probing step */                             \
+    field(double, clock_rounding)          /* of the end of a step, over its length, that counts */ \
     /* Placement: control/placement.py. */                                                         \
     field(double, max_sigma_change)        /* per step */                                          \
     field(double, scatter_from)            /* least abscissa of slopes of a sigma that jumps */        \

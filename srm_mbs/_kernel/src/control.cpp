@@ -29,19 +29,27 @@ double sigma_slope(const std::vector<double>& abscissae, const std::vector<doubl
     return out / h;
 }
 
+// A step of about the length h: times far from zero are coarse, and the motion is to advance by what
+// the clock does.
+Proposal over(double t, double h, const Constants& constants, bool placed = false) {
+    const double t_new = t + h, size = std::abs(t_new);
+    if (std::nextafter(size, inf) - size > constants.clock_rounding * h) h = t_new - t;
+    return {h, t_new, placed};
+}
+
 // A step of at most h that neither passes `end` nor leaves a sliver before it.
-Proposal until(double t, double h, double end) {
+Proposal until(double t, double h, double end, const Constants& constants) {
     const double remaining = end - t;
     if (h >= remaining * (1.0 - 1e-12)) return {remaining, end};
     if (2.0 * h > remaining) h = 0.5 * remaining;
-    return {h, t + h};
+    return over(t, h, constants);
 }
 
 }  // namespace
 
 Proposal PIControl::propose(double t, double limit, IntegratorState& memory) {
     order_ = orders_[memory.stiff];
-    return until(t, std::min(h_, limit), t_end_);
+    return until(t, std::min(h_, limit), t_end_, constants_);
 }
 
 StepDecision PIControl::decide(const Proposal& proposal, const StepResult* result) {
@@ -70,7 +78,7 @@ StepDecision PIControl::decide(const Proposal& proposal, const StepResult* resul
 Proposal FixedStep::propose(double t, double limit, IntegratorState&) {
     double target = t0_ + static_cast<double>(index_) * step_;
     if (target > t_end_ - 1e-9 * step_) target = t_end_;
-    if (limit < target - t) return {limit, t + limit};
+    if (limit < target - t) return over(t, limit, constants_);
     return {target - t, target};
 }
 
@@ -159,7 +167,7 @@ Proposal SingularityPlacement::propose(double t, double limit, IntegratorState& 
         const double h = placed_step(zero_ - t, proposal.h, t);
         if (h != proposal.h) {
             ++placed;
-            return {h, t + h, true};
+            return over(t, h, constants_, true);
         }
     }
     return proposal;

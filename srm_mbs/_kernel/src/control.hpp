@@ -104,7 +104,8 @@ private:
 
 class FixedStep : public Control {
 public:
-    FixedStep(double t0, double t_end, double step) : t0_(t0), t_end_(t_end), step_(step) {
+    FixedStep(double t0, double t_end, double step, const Constants& constants)
+        : t0_(t0), t_end_(t_end), step_(step), constants_(constants) {
         adaptive = false;
     }
     Proposal propose(double t, double limit, IntegratorState& memory) override;
@@ -125,6 +126,7 @@ private:
     double sliver() const { return std::max(1e-9, 1e-14 * static_cast<double>(index_)) * step_; }
 
     double t0_, t_end_, step_;
+    const Constants& constants_;
     long index_ = 1;
 };
 

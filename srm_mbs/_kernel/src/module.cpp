@@ -1133,7 +1133,7 @@ struct PyRun {
         const double t_end = intervals.ends.back();
         std::unique_ptr<Control> control;
         if (options.step > 0.0) {
-            control = std::make_unique<FixedStep>(t0, t_end, options.step);
+            control = std::make_unique<FixedStep>(t0, t_end, options.step, constants);
         } else {
             double first = first_step;
             if (!(first > 0.0))

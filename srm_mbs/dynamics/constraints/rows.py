@@ -290,6 +290,8 @@ class _LoopRows:
         ]
         self._at_a: list[float] = in_a.translation.tolist()
         self._at_b: list[float] = in_b.translation.tolist()
+        # Of places counted from bases: where the point of b is, on the ground from the base of a,
+        # and the base of a seen from that of b.
         self._target, self.apart = self._at_b, [0.0, 0.0, 0.0]
         self.support = support(model, self.joint_a) - support(model, self.joint_b)
         self.first_row = start
@@ -569,8 +571,7 @@ class LoopKinematics:
 
     def count_from(self, bases: FloatArray) -> Self:
         """Expect from now on that :meth:`update` finds places, velocities and the Jacobian of each
-        tree counted from its base, one of ``bases`` (njoints, 3)
-        (:class:`Trees`)."""
+        tree counted from its base, one of ``bases`` (njoints, 3), as :class:`Trees` has them."""
         own = [rows for rows in self._loops if isinstance(rows, _LoopRows)]
         for rows in own:
             rows.count_from(bases)

@@ -134,6 +134,7 @@ def constants() -> Any:
         rate_overflow=step_size.RATE_OVERFLOW,
         first_step_probe=step_size.PROBE_LENGTH,
         longest_first_step=step_size.LONGEST_FIRST,
+        clock_rounding=step_size.CLOCK_ROUNDING,
         # Placement.
         max_sigma_change=placement.SIGMA_CHANGE,
         scatter_from=placement.SCATTER_FROM,

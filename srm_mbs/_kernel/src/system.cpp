@@ -1533,7 +1533,7 @@ void System::write_rows(double t, const double* q, double* G, int width) {
     auto& w = *work_;
     t = std::clamp(t, first_, last_);
     w.place(q);
-    pinocchio::computeJointJacobians(w.model, w.data, Argument(w.q));
+    pinocchio_model::place_bodies(w);
     update_closures(q, false);
     update_drives(t, false);
     const auto copy = [&](int row, int j) { G[row * width + j] = filled(row)[j]; };

@@ -3,6 +3,7 @@
 #include <type_traits>
 
 #include <pinocchio/algorithm/crba.hpp>
+#include <pinocchio/algorithm/jacobian.hpp>
 #include <pinocchio/algorithm/kinematics.hpp>
 #include <pinocchio/algorithm/rnea.hpp>
 
@@ -44,6 +45,33 @@ struct IsUsual : boost::static_visitor<bool> {
 
 using AtState = boost::fusion::vector<const Model&, Data&, const Argument&, const Argument&>;
 
+// Placement of the body of a joint whose own data are computed.
+template <typename JointModel>
+void place_body(const JointModelBase<JointModel>& jmodel,
+                const JointDataBase<typename JointModel::JointDataDerived>& jdata,
+                const Model& model, Data& data) {
+    const JointIndex i = jmodel.id(), parent = model.parents[i];
+    data.liMi[i] = model.jointPlacements[i] * jdata.M();
+    if (parent > 0) data.oMi[i] = data.oMi[parent] * data.liMi[i];
+    else data.oMi[i] = data.liMi[i];
+}
+
+// JointJacobiansForwardStep, flattened as those below.
+struct Place : pinocchio::fusion::JointUnaryVisitorBase<Place> {
+    using ArgsType = boost::fusion::vector<const Model&, Data&, const Argument&>;
+
+    template <typename JointModel>
+    [[gnu::flatten]] static void algo(const JointModelBase<JointModel>& jmodel,
+                                      JointDataBase<typename JointModel::JointDataDerived>& jdata,
+                                      const Model& model, Data& data, const Argument& q) {
+        if constexpr (usual<JointModel>) {
+            jmodel.calc(jdata.derived(), q);
+            place_body(jmodel, jdata, model, data);
+            jmodel.jointExtendedModelCols(data.J) = data.oMi[jmodel.id()].act(jdata.S());
+        }
+    }
+};
+
 // Placement and velocity of the body of a joint: ForwardKinematicFirstStep.
 template <typename JointModel>
 void move_body(const JointModelBase<JointModel>& jmodel,
@@ -51,14 +79,9 @@ void move_body(const JointModelBase<JointModel>& jmodel,
                Data& data, const Argument& q, const Argument& v) {
     const JointIndex i = jmodel.id(), parent = model.parents[i];
     jmodel.calc(jdata.derived(), q, v);
-    data.liMi[i] = model.jointPlacements[i] * jdata.M();
+    place_body(jmodel, jdata, model, data);
     data.v[i] = jdata.v();
-    if (parent > 0) {
-        data.oMi[i] = data.oMi[parent] * data.liMi[i];
-        data.v[i] += data.liMi[i].actInv(data.v[parent]);
-    } else {
-        data.oMi[i] = data.liMi[i];
-    }
+    if (parent > 0) data.v[i] += data.liMi[i].actInv(data.v[parent]);
 }
 
 // Flattened, because products of six numbers cost less than calls.
@@ -118,6 +141,17 @@ bool has_usual_joints(const Model& model) {
     for (std::size_t i = 1; i < model.joints.size(); ++i)
         if (!boost::apply_visitor(IsUsual(), model.joints[i].toVariant())) return false;
     return true;
+}
+
+void place_bodies(Workspace& work) {
+    const Model& model = work.model;
+    const Argument q(work.q);
+    if (!work.one_pass) {
+        pinocchio::computeJointJacobians(model, work.data, q);
+        return;
+    }
+    for (int i = 1; i < model.njoints; ++i)
+        Place::run(model.joints[i], work.data.joints[i], Place::ArgsType(model, work.data, q));
 }
 
 void move_bodies(Workspace& work, const std::vector<int>* joints) {

@@ -20,6 +20,9 @@ bool has_usual_joints(const pinocchio::Model& model);
 // With other joints it calls the two algorithms.
 void compute_terms(Workspace& work);
 
+// Pinocchio's computeJointJacobians at q of the workspace, by the same statements.
+void place_bodies(Workspace& work);
+
 // Pinocchio's forwardKinematics at q and v of the workspace, by the same statements: of all bodies or,
 // which costs less, of those of `joints` alone, ascending and with the parents of each.
 void move_bodies(Workspace& work, const std::vector<int>* joints = nullptr);

@@ -668,6 +668,7 @@ void System::use_code(const GeneratedTerms* code) {
         law_values_.resize(laws);
         held_values_.resize(held);
         own_laws_.resize(nv);
+        unused_.resize(n * n + 3 * n + data_.rows);
         if (code->linearises()) {
             turns_.resize(5 * bushings);
             multipliers_.resize(data_.rows);
@@ -1533,21 +1534,37 @@ void System::write_rows(double t, const double* q, double* G, int width) {
     auto& w = *work_;
     t = std::clamp(t, first_, last_);
     w.place(q);
-    pinocchio_model::place_bodies(w);
-    update_closures(q, false);
-    update_drives(t, false);
     const auto copy = [&](int row, int j) { G[row * width + j] = filled(row)[j]; };
-    for (const ClosureRows& closure : data_.closures)
-        for (std::size_t k = 0; k < closure.count(); ++k)
-            for (int j : closure.columns) copy(closure.first_row + static_cast<int>(k), j);
-    for (const JointRow& joints : data_.joint_rows)
-        for (int j : joints.in_v) copy(joints.row, j);
-    for (const Elimination& e : data_.eliminations)
-        for (int j : e.columns) copy(e.row, j);
+    if (!generated_rows(q, G, width)) {
+        pinocchio_model::place_bodies(w);
+        update_closures(q, false);
+        for (const ClosureRows& closure : data_.closures)
+            for (std::size_t k = 0; k < closure.count(); ++k)
+                for (int j : closure.columns) copy(closure.first_row + static_cast<int>(k), j);
+        for (const JointRow& joints : data_.joint_rows)
+            for (int j : joints.in_v) copy(joints.row, j);
+        for (const Elimination& e : data_.eliminations)
+            for (int j : e.columns) copy(e.row, j);
+    }
+    update_drives(t, false);
     for (const DrivenRow& drive : data_.drives) {
         if (drive.in_v >= 0) copy(drive.row, drive.in_v);
         G[drive.row * width + nv] = -pushed_[drive.row];
     }
+}
+
+// g and the rows of all closures by generated code: with all other terms at rest they cost less than
+// alone without it.  False without code, and where points coincide, which ends its evaluation.
+bool System::generated_rows(const double* q, double* G, int width) {
+    if (!code_) return false;
+    const std::size_t n = nv;
+    double *const M = unused_.data(), *const nle = M + n * n, *const forces = nle + n;
+    double *const rest = forces + n, *const bias = rest + n;
+    std::fill_n(rest, n, 0.0);
+    for (int row = 0; row < data_.rows; ++row) columns_of_rows_[row] = G + row * width;
+    return code_->evaluate(q, rest, law_values_.data(), nullptr, M, nle, forces, forces,
+                           held_values_.data(), own_laws_.data(), g_.data(), bias,
+                           columns_of_rows_.data(), bushing_bodies_.data(), work_->data.J.data());
 }
 
 }  // namespace srm

@@ -403,6 +403,7 @@ private:
     void joined_values();
     void factorise_mass();
     void generated_terms(double t, const double* state, ForceLaws* laws);
+    bool generated_rows(const double* q, double* G, int width);
     void acceleration_of(double* r, const double* c);
     double passive_force(int i) const;
     double passive_slope(int i) const;
@@ -420,6 +421,7 @@ private:
     std::vector<double*> columns_of_rows_;
     std::vector<double*> bushing_bodies_;  // the memory of their kinematics
     std::vector<double> held_values_, own_laws_;
+    std::vector<double> unused_;  // what code computes beside the rows of closures
     // Of generated derivatives, column by column: residuals by (q, v, laws), rows and laws by (q, v),
     // laws of coordinates by their own.
     std::vector<double> turns_, multipliers_, Dr_, Dc_, Dl_, Dq_, Dv_;

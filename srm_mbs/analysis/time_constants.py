@@ -146,7 +146,7 @@ def _mobilities(mechanism: Mechanism, directions: FloatArray) -> FloatArray:
     """alpha (k,) of the ``directions`` (nv, k); 0 for those that closures hold."""
     system = make_system(mechanism)
     if isinstance(system, ClosedSystem):
-        system.evaluate(0.0, np.concatenate([mechanism.q0, mechanism.v0]))
+        system.evaluate(0.0, mechanism.start_state)
         U, normals = system.projection.U, system.projection.normals()
     else:
         model = mechanism.model

@@ -432,6 +432,11 @@ class MechanismData(ResultOwner):
         for array in (self.q0, self.v0):
             array.setflags(write=False)
 
+    @property
+    def start_state(self) -> FloatArray:
+        """The initial state, q0 and v0 (nq + nv,), read-only."""
+        return _start_state(self)
+
     def _take_start(self, q0: Any, v0: Any) -> None:
         q0, v0 = checked_start(self.model, q0, v0)
         object.__setattr__(self, "q0", q0)
@@ -564,6 +569,13 @@ def _laws(mechanism: MechanismData) -> tuple[tuple[str, Law], ...]:
         laws = given if isinstance(given, tuple) else (given,)
         found += [(f"force {force.name!r}", law) for law in laws]
     return tuple(found)
+
+
+@per_start
+def _start_state(mechanism: MechanismData) -> FloatArray:
+    state = np.concatenate([mechanism.q0, mechanism.v0])
+    state.setflags(write=False)
+    return state
 
 
 @per_start

@@ -452,7 +452,7 @@ def initial_state(
     if not known:
         start_at = mechanism.with_state if t0 == 0.0 else mechanism.moved
         mechanism = start_at(mechanism.q0 if q0 is None else q0, mechanism.v0 if v0 is None else v0)
-    return mechanism, np.concatenate([mechanism.q0, mechanism.v0])
+    return mechanism, mechanism.start_state
 
 
 @per_start

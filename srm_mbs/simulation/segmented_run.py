@@ -616,7 +616,7 @@ def _switched(
         )
     new = new.with_state(q if switch.q is None else switch.q, v if switch.v is None else switch.v)
     new = new.with_drive_curves(_curves_from(t, mechanism, new))
-    given = np.concatenate([new.q0, new.v0])
+    given = new.start_state
     system = make_system(new)
     x = onto_closures(system, t, given)
     if system.position_norm(system.difference(given, x)) > LARGEST_PROJECTION:

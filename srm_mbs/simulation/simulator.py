@@ -335,7 +335,7 @@ class Simulator:
         mechanism = self._mechanism
         t = finite(t, "t")
         if q is None and v is None and not project:
-            state = np.concatenate([mechanism.q0, mechanism.v0])
+            state = mechanism.start_state
         else:
             q = mechanism.q0 if q is None else q
             v = mechanism.v0 if v is None else v
@@ -371,7 +371,7 @@ class Simulator:
         if project:
             try:
                 given = self._mechanism.moved(q, v)
-                state = np.concatenate([given.q0, given.v0])
+                state = given.start_state
                 state = onto_closures(self._system, t, state)
             except EvaluationError as error:
                 raise InputError(
@@ -382,7 +382,7 @@ class Simulator:
             q, v = state[: self._nq], state[self._nq :]
         moved = self._mechanism.moved(q, v)
         check_consistent(moved, t)
-        return np.concatenate([moved.q0, moved.v0])
+        return moved.start_state
 
     def clone(self) -> Simulator:
         """An independent copy, which continues identically; its statistics start at 0."""

@@ -380,16 +380,19 @@ public:
         }
     }
 
-    // Norm of the residual for `values`, which are overwritten, and the coefficients, lowest power
-    // first.
-    double fit(std::vector<double>& values, double* coefficients) const {
+    // Norm of the residual for `values`, which are reflected in place.
+    double residual(std::vector<double>& values) const {
         for (int k = 0; k < columns_; ++k) reflect(k, values.data());
+        return norm(values.data() + columns_, rows_ - columns_);
+    }
+
+    // The coefficients, lowest power first, from reflected values.
+    void solve(const std::vector<double>& values, double* coefficients) const {
         for (int k = columns_ - 1; k >= 0; --k) {
             double sum = values[k];
             for (int j = k + 1; j < columns_; ++j) sum -= A_[j * rows_ + k] * coefficients[j];
             coefficients[k] = sum / diagonal_[k];
         }
-        return norm(values.data() + columns_, rows_ - columns_);
     }
 
 private:
@@ -445,9 +448,10 @@ double zero_within(const std::vector<double>& abscissae, const std::vector<doubl
         const double after = k < n ? c[k] : 1.1;
         if (after <= c[k - 1]) continue;
         for (int i = 0; i < n; ++i) values[i] = i < k ? sigma[i] : -sigma[i];
-        double p[3] = {0.0, 0.0, 0.0};
-        const double error = polynomials.fit(values, p);
+        const double error = polynomials.residual(values);
         if (!(error < best)) continue;
+        double p[3] = {0.0, 0.0, 0.0};
+        polynomials.solve(values, p);
         double roots[2];
         int found = 0;
         if (p[2] == 0.0) {

@@ -110,7 +110,7 @@ class LiveView:
         # The cost of one state is measured before the run.
         began = time.perf_counter()
         try:
-            self._send(0.0, np.concatenate([mechanism.q0, mechanism.v0]), REPLY_TIME)
+            self._send(0.0, mechanism.start_state, REPLY_TIME)
         except BaseException:
             self.close()
             raise

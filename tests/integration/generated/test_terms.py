@@ -199,7 +199,8 @@ def test_rows_of_closures_are_those_of_the_reference(ground: bool) -> None:
 
 
 def _agree(mechanism: srm.Mechanism, count: int = 8) -> None:
-    """Assert that evaluations by generated code and by the kernel agree, next to start states."""
+    """Assert that evaluations by generated code and by the kernel agree, next to start states, and
+    the rows of closures alone."""
     system = make_system(mechanism)
     kernel, generated = make_kernel_system(system), make_kernel_system(system, load_code(mechanism))
     for q, v in _states(mechanism, count):
@@ -213,6 +214,9 @@ def _agree(mechanism: srm.Mechanism, count: int = 8) -> None:
             size = np.abs(a[key]).max()
             if np.isfinite(size):
                 assert np.abs(a[key] - b[key]).max() <= max(allowed, 1e-12) * max(size, 1e-3), key
+        for own, expected in zip(generated.rows_at(0.3, q), kernel.rows_at(0.3, q)):
+            largest = np.abs(expected).max(initial=1.0)
+            assert np.abs(own - expected).max(initial=0.0) < 1e-13 * largest
 
 
 @pytest.mark.parametrize("angle", [-1e3, 9e5, 1e7])

@@ -370,9 +370,8 @@ class Simulator:
     def _consistent(self, q: Any, v: Any, t: float, project: bool) -> FloatArray:
         if project:
             try:
-                given = self._mechanism.moved(q, v)
-                state = given.start_state
-                state = onto_closures(self._system, t, state)
+                given = self._mechanism.moved(q, v).start_state
+                state = onto_closures(self._system, t, given)
             except EvaluationError as error:
                 raise InputError(
                     f"the state cannot be projected: {error}",

@@ -12,7 +12,7 @@ namespace srm {
 namespace {
 
 // Entries and changes below this part of a column's norm are dropped.
-constexpr double negligible = 1e-17;
+constexpr double negligible = 1e-16;
 // Columns of a block, which remembers its largest norm.
 constexpr int block = 32;
 // Number of columns up to which the working matrix is not packed: their bits fill one word.

@@ -7,9 +7,9 @@
 // columns that share rows with it.
 //
 // Along a chain of loops the entries of Q and R decay geometrically without becoming zero.  Entries
-// below `negligible` of a column's norm, a tenth of the rounding error of the dense algebra, are
-// dropped: this bounds the rows of a reflection and the columns that it changes.  When half of the
-// columns are done, the others are packed into a contiguous matrix.
+// below `negligible` of a column's norm, less than what one operation of the dense algebra rounds
+// off, are dropped: this bounds the rows of a reflection and the columns that it changes.  When half
+// of the columns are done, the others are packed into a contiguous matrix.
 //
 // Of equal norms the first by position is the pivot, as in the dense algebra.  Rounding differs: of
 // two columns whose norms agree to rounding, either may be the pivot.

@@ -28,6 +28,7 @@ from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend, code_is
 from srm_mbs.integration.messages import FailureCause
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.model.numbers import real_array
 from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
 from srm_mbs.simulation.incremental_run import IncrementalRun, KernelRun, ReferenceRun
 from srm_mbs.simulation.options import (
@@ -281,7 +282,7 @@ class Simulator:
                     remedy="Give finite forces of joints by their names, N and N m",
                 ) from error
         try:
-            force = np.array(tau, dtype=float)  # the caller may change it afterwards
+            force = real_array(tau)  # the caller may change it afterwards
         except (TypeError, ValueError) as error:
             raise _bad_force(tau) from error
         if force.shape != self._no_force.shape:

@@ -145,7 +145,7 @@ def cost_per_evaluation(name: str, repeats: int) -> tuple[float, float, float]:
     """
     mechanism = srm.load(name)
     system = make_system(mechanism)
-    state = np.concatenate([mechanism.q0, mechanism.v0])
+    state = mechanism.start_state
     model, data = mechanism.model, mechanism.model.createData()
 
     def whole() -> None:
@@ -193,7 +193,7 @@ def orders() -> list[tuple[str, int, float, float]]:
 def beside_scipy(name: str, tol: float = 1e-6, t_end: float = 10.0) -> tuple[float, float]:
     """Largest ||g|| of SciPy's DOP853 on the index-1 equations, and of ours, same tolerances."""
     mechanism = srm.load(name)
-    start = np.concatenate([mechanism.q0, mechanism.v0])
+    start = mechanism.start_state
     theirs = solve_ivp(
         reduced.index_one(mechanism), (0.0, t_end), start, method="DOP853", rtol=tol, atol=tol
     )
@@ -208,7 +208,7 @@ def beside_scipy(name: str, tol: float = 1e-6, t_end: float = 10.0) -> tuple[flo
 def scipy_leaves_the_branch(tol: float) -> float | None:
     """When SciPy's DOP853 on the index-1 equations of slider_crank leaves its branch (s), if so."""
     mechanism = srm.load("slider_crank")
-    start = np.concatenate([mechanism.q0, mechanism.v0])
+    start = mechanism.start_state
     run = solve_ivp(
         reduced.index_one(mechanism), (0.0, 10.0), start, method="DOP853", rtol=tol, atol=tol
     )

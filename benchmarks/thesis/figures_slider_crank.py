@@ -64,7 +64,7 @@ def _fixed_step(
     out: Path, key: str, system: Any, t_end: float, text: str
 ) -> tuple[str, dict[str, Any]]:
     mechanism = system.mechanism
-    start = np.concatenate([mechanism.q0, mechanism.v0])
+    start = mechanism.start_state
     method = PublishedSRM("tvd32", 3, eps=0.001)
     t, states = fixed_step_run(system, method, start, t_end, 0.001, every=10)
     drift = _drift(mechanism, states)
@@ -169,7 +169,7 @@ def _adaptive(
     """A run with the thesis' step-size control at ATOL = RTOL = 0.01."""
     norm = ErrorNorm(np.full(system.tangent_size, TOLERANCE), TOLERANCE)
     mechanism = system.mechanism
-    start = np.concatenate([mechanism.q0, mechanism.v0])
+    start = mechanism.start_state
     memory = method.start(system, 0.0, start, norm)
     log = _Log(t_end, first_step, memory, norm)
     record = integrate(system, method, log, norm, memory, start, 0.0, t_end)

@@ -71,7 +71,7 @@ def per_call(call: Callable[[], Any], repeats: int, seconds: float = 0.02) -> fl
 def parts(mechanism: srm.Mechanism, repeats: int) -> dict[str, float]:
     """Microseconds of an evaluation, of Pinocchio in it, and of LAPACK in it."""
     system = make_system(mechanism)
-    state = np.concatenate([mechanism.q0, mechanism.v0])
+    state = mechanism.start_state
     model, data = mechanism.model, workspace(mechanism.model)
     q, v = np.array(mechanism.q0), np.array(mechanism.v0)
     zero = np.zeros(model.nv)

@@ -171,7 +171,7 @@ def _islands() -> Item:
     """On the kernel: its sparse algebra never lets islands meet, the dense one mixes them."""
     double = _twice(srm.load("n_four_bar_2"))
     system = make_system(double)
-    state = np.concatenate([double.q0, double.v0])
+    state = double.start_state
 
     def evaluate(algebra: str) -> Callable[[], None]:
         constants = system.constants() | {"algebra": algebra}

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -94,13 +94,13 @@ class Equilibrium:
     """
 
     q: FloatArray
-    multipliers: Mapping[str, FloatArray]
-    reactions: Mapping[str, FloatArray]
-    joint_reactions: Mapping[str, FloatArray]
+    multipliers: Mapping[str, FloatArray] = field(repr=False)
+    reactions: Mapping[str, FloatArray] = field(repr=False)
+    joint_reactions: Mapping[str, FloatArray] = field(repr=False)
     holding: Mapping[str, FloatArray]
     residual: float
     eigenvalues: Any
-    modes: Any
+    modes: Any = field(repr=False)
     stable: bool
     neutral: bool
     singular: bool

@@ -62,6 +62,12 @@ class InverseDynamics:
     residual: FloatArray
     _reactions: Callable[[], Reactions] = field(repr=False)
 
+    def __repr__(self) -> str:
+        return (
+            f"InverseDynamics({len(self.t)} times, {len(self.actuated)} actuated coordinates, "
+            f"residual at most {self.residual.max(initial=0.0):.2g})"
+        )
+
     @cached_property
     def _computed(self) -> Reactions:
         return self._reactions()

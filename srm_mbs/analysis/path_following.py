@@ -73,6 +73,12 @@ class FollowedPath:
     path: FloatArray
     message: str
 
+    def __repr__(self) -> str:
+        return (
+            f"FollowedPath({self.mechanism.name!r}, {len(self.q)} values reached, "
+            f"{len(self.path)} configurations, {len(self.singular)} singular, {self.message!r})"
+        )
+
     def motion(self, duration: float = 3.0) -> JointMotion:
         """The path as a motion of ``duration`` (s), which can be animated.
 

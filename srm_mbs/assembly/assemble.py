@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -105,7 +105,7 @@ class Assembly:
     v: FloatArray
     residuals: FloatArray
     rate_residuals: FloatArray
-    free_directions: FloatArray
+    free_directions: FloatArray = field(repr=False)
     singular: bool
 
 

@@ -127,7 +127,7 @@ def cannot_close(
         for name, closed in closings.items()
         if (value := _nearest(mechanism, problem, start, closed, name, held)) is not None
     }
-    remedy = "Free some of them: put them into guess instead of q"
+    remedy = "Free some of them: leave them out, or give them as guesses"
     if len(guilty) < len(held) or len(held) == 1:
         remedy = f"Change or free one of {quoted(guilty)}: with it free, the loops close"
     if nearest:

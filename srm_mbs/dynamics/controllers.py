@@ -16,6 +16,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.errors import ControllerError, InputError, safe_repr
 from srm_mbs.model.mechanism import MechanismData
+from srm_mbs.model.numbers import real_array
 
 
 class HeldForce:
@@ -144,7 +145,7 @@ def _numbers(given: Any, size: int, scalar: bool = False) -> FloatArray | str:
     """A copy of ``given`` as ``size`` finite numbers, or what it is instead; a ``scalar`` is one
     number without an axis as well."""
     try:
-        result = np.array(given, dtype=float, order="C")
+        result = real_array(given)
     except Exception:  # objects may raise anything
         return safe_repr(given)
     if scalar and size == 1 and result.ndim == 0:

@@ -32,6 +32,7 @@ from srm_mbs.dynamics.system import Zone
 from srm_mbs.errors import CallbackError, EvaluationError, InputError, safe_repr
 from srm_mbs.model.dae import SemiExplicitDAE
 from srm_mbs.model.lazy import cached_property
+from srm_mbs.model.numbers import real_array
 
 
 class ObliqueProjection:
@@ -285,10 +286,7 @@ class DaeSystem:
             If it returns values that are not finite.
         """
         try:
-            returned = getattr(self.problem, name)(t, x.copy())
-            if np.iscomplexobj(returned):
-                raise TypeError("complex values")
-            value = np.array(returned, dtype=float)
+            value = real_array(getattr(self.problem, name)(t, x.copy()))
         except Exception as error:
             raise CallbackError(f"{name} raised {safe_repr(error)} at t = {t:.6g}") from error
         if value.shape not in self._accepted(name):
@@ -306,7 +304,7 @@ class DaeSystem:
 
     def _count_rows(self, t: float, x: FloatArray) -> int:
         try:
-            value = np.asarray(self.problem.g(t, x.copy()), dtype=float)
+            value = real_array(self.problem.g(t, x.copy()))
         except Exception as error:
             raise InputError(
                 f"g raised {safe_repr(error)} at the start",

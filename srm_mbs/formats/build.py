@@ -203,6 +203,8 @@ class Reading:
         Sentences about approximations and ignored elements.
     check
         Of the assembled mechanism (:attr:`~srm_mbs.formats.translation.Translation.check`).
+    explain
+        As of :class:`~srm_mbs.formats.translation.Translation`.
     kind
         The class of the mechanism.
     variants
@@ -223,6 +225,7 @@ class Reading:
     source: Source
     notes: tuple[str, ...] = ()
     check: Callable[[Mechanism], None] | None = None
+    explain: Callable[[AssemblyError], None] | None = None
     kind: type[Mechanism] = Mechanism
     variants: VariantMaker | None = None
     analysis: ReusableAnalysis | None = None
@@ -522,6 +525,8 @@ def assembled(reading: Reading) -> Mechanism:
         if joint is None:
             _analysed(mechanism, reading)
     except AssemblyError as error:
+        if reading.explain is not None:
+            reading.explain(error)
         error.remedy += _advice(error)
         if description.lock:
             locked = ", ".join(map(repr, description.lock))

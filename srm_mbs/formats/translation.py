@@ -16,6 +16,7 @@ from xml.etree.ElementTree import Element, indent, tostring
 import pinocchio as pin
 
 from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.errors import AssemblyError
 from srm_mbs.formats.graph.joint_graph import Body, Joint
 from srm_mbs.formats.toml.parameters import Place
 from srm_mbs.formats.toml.schema import PlanarEntry
@@ -135,6 +136,9 @@ class NumbersOfVariants(Protocol):
     def check(self, mechanism: Mechanism) -> None:
         """As of a :class:`Translation`."""
 
+    def explain(self, error: AssemblyError) -> None:
+        """As of a :class:`Translation`."""
+
 
 @dataclass(frozen=True, eq=False)
 class Translation:
@@ -157,6 +161,9 @@ class Translation:
         The file that the URDF came from, if it is another one than that translated.
     check
         Raises InputError if the assembled mechanism cannot be what the file is meant to describe.
+    explain
+        Changes the error about loops that do not close, or rates that contradict each other, to one
+        about what the file has, where that differs from the entries.
     parts
         The bodies and joints of the tree, for :class:`KnownTree`; None where variants are built
         from their tree, or made from another.
@@ -173,6 +180,7 @@ class Translation:
     notes: tuple[str, ...] = ()
     urdf_file: str = ""
     check: Callable[[Mechanism], None] | None = None
+    explain: Callable[[AssemblyError], None] | None = None
     parts: TreeParts | None = None
     model: pin.Model | None = None
     vary: Callable[[Sequence[Place]], NumbersOfVariants | None] | None = None

@@ -37,10 +37,9 @@ def finite_array(
     if type(values) is np.ndarray and values.dtype == float and shape in (None, values.shape):
         return (values.copy() if new else values) if _all_finite(values) else None
     try:
-        given = np.asarray(values)
-        if given.dtype.kind == "c" or np.ma.is_masked(values):
-            return None  # NumPy drops imaginary parts with no more than a warning, and masks
-        array: FloatArray = given.astype(float, copy=new)
+        if np.ma.is_masked(values):
+            return None  # NumPy drops masks
+        array = real_array(values, new=new)
     except Exception:  # objects may raise anything
         return None
     fits = shape in (None, array.shape) or (
@@ -50,6 +49,24 @@ def finite_array(
     if not fits:
         return None
     return array if _all_finite(array) else None
+
+
+def real_array(values: Any, *, new: bool = True) -> FloatArray:
+    """``values`` as an array of floats of any shape; ``new`` as of :func:`finite_array`.
+
+    Raises
+    ------
+    TypeError
+        If they are complex: NumPy drops imaginary parts with no more than a warning.
+    Exception
+        Whatever their conversion raises.
+    """
+    given = np.array(values, order="C") if new else np.asarray(values)
+    if given.dtype == float:
+        return given
+    if given.dtype.kind == "c":
+        raise TypeError("complex values")
+    return given.astype(float)
 
 
 def _all_finite(array: FloatArray) -> bool:

@@ -274,22 +274,25 @@ def without(what: str, parts: Sequence[Part], name: str) -> tuple[Part, ...]:
     return kept
 
 
-def checked_start(model: pin.Model, q0: Any, v0: Any) -> tuple[FloatArray, FloatArray]:
-    """Read-only copies of an initial state, q0 (nq,) and v0 (nv,).
+def checked_start(
+    model: pin.Model, q0: Any, v0: Any, names: tuple[str, str] = ("q0", "v0")
+) -> tuple[FloatArray, FloatArray]:
+    """Read-only copies of an initial state, q0 (nq,) and v0 (nv,), which messages call ``names``.
 
     Raises
     ------
     InputError
         If a shape does not fit, a number is not finite, or a quaternion is not of unit length.
     """
-    q0 = _frozen_array(q0, model.nq, "q0")
+    position, rate = names
+    q0 = _frozen_array(q0, model.nq, position)
     if model.nq > model.nv and not pin.isNormalized(model, q0, 1e-9):
         raise InputError(
-            "q0 has a quaternion, or a (cos, sin) pair, that is not of unit length",
-            element="q0",
-            remedy="Use pinocchio.normalize(model, q0)",
+            f"{position} has a quaternion, or a (cos, sin) pair, that is not of unit length",
+            element=position,
+            remedy=f"Use pinocchio.normalize(model, {position})",
         )
-    return q0, _frozen_array(v0, model.nv, "v0")
+    return q0, _frozen_array(v0, model.nv, rate)
 
 
 def _frozen_array(values: Any, size: int, name: str) -> FloatArray:

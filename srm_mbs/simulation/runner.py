@@ -466,9 +466,11 @@ def check_consistent(
     t: float = 0.0,
     backend: str = "python",
     system: OpenSystem | ClosedSystem | None = None,
+    names: tuple[str, str] = ("q0", "v0"),
 ) -> None:
     """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates, which
-    ``backend`` evaluates; ``system`` is that of the mechanism, if it is at hand.
+    ``backend`` evaluates; ``system`` is that of the mechanism, if it is at hand.  Messages call
+    positions and rates ``names``.
 
     Raises
     ------
@@ -477,12 +479,16 @@ def check_consistent(
     """
     accepted = _accepted_times(mechanism)
     if t not in accepted:
-        _check_errors(mechanism, t, backend, system)
+        _check_errors(mechanism, t, backend, system, names)
         accepted.add(t)
 
 
 def _check_errors(
-    mechanism: Mechanism, t: float, backend: str, system: OpenSystem | ClosedSystem | None
+    mechanism: Mechanism,
+    t: float,
+    backend: str,
+    system: OpenSystem | ClosedSystem | None,
+    names: tuple[str, str],
 ) -> None:
     q0, v0 = mechanism.q0, mechanism.v0
     units = mechanism.structure.units
@@ -502,7 +508,7 @@ def _check_errors(
         g, c = (e[0] for e in constraint_errors(mechanism, *start))
     if not len(g):
         return
-    for what, values, limit in (("q0", g, CONSISTENT), ("v0", c, CONSISTENT * speed)):
+    for what, values, limit in zip(names, (g, c), (CONSISTENT, CONSISTENT * speed), strict=True):
         errors = np.abs(values) / unit
         if max(errors.tolist()) > limit:
             worst = int(errors.argmax())

@@ -186,3 +186,11 @@ def test_where_there_is_no_equilibrium_it_says_so() -> None:
         with pytest.raises(srm.AnalysisError, match=r"no .*equilibrium was found") as caught:
             srm.equilibrium(mechanism, search=search)
         assert caught.value.q.shape == (3,)
+
+
+def test_an_equilibrium_is_shown_by_its_state_without_its_reactions() -> None:
+    shown = repr(srm.equilibrium(load("stewart_platform")))
+    assert "stable=" in shown
+    assert "eigenvalues=array(" in shown
+    assert "reactions" not in shown
+    assert len(shown) < 1000

@@ -146,3 +146,11 @@ def test_a_motion_given_as_a_function_may_be_read_at_no_time() -> None:
         found = srm.inverse_dynamics(mechanism, motion, "crank", t=[])
         assert found.torques.shape == (0, 1)
         assert found.reactions["pin"].shape == (0, 6)
+
+
+def test_inverse_dynamics_are_shown_in_one_line() -> None:
+    mechanism = load("four_bar")
+    found = srm.inverse_dynamics(mechanism, srm.simulate(mechanism, 0.5))
+    shown = repr(found)
+    assert shown.startswith(f"InverseDynamics({len(found.t)} times, 3 actuated coordinates, resid")
+    assert float(shown.split()[-1].rstrip(")")) == pytest.approx(found.residual.max(), rel=0.05)

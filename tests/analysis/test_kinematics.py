@@ -127,6 +127,16 @@ def test_every_position_is_closed_and_next_to_the_one_before(name: str, crank: s
         assert here == pytest.approx(mark.position, abs=1e-3)
 
 
+def test_the_motion_of_a_crank_is_shown_in_one_line() -> None:
+    turning = srm.kinematics(load("slider_crank"), "crank")
+    assert repr(turning) == (
+        f"CrankMotion('slider_crank', crank='crank', turns fully, "
+        f"{len(turning.singular_positions)} singular, {len(turning.q)} configurations)"
+    )
+    swinging = srm.kinematics(load("four_bar"), "rocker")
+    assert "crank='rocker', 2 dead points, 0 singular" in repr(swinging)
+
+
 def test_other_mechanisms_are_refused() -> None:
     assert "2 degrees of freedom" in refused(lambda: srm.kinematics(load("five_bar"), "crank_left"))
     assert "without loops" in refused(lambda: srm.kinematics(load("simple_pendulum"), "pendulum"))

@@ -95,3 +95,15 @@ def test_a_path_can_be_played() -> None:
     motion = path.motion(2.0)
     np.testing.assert_array_equal(motion(0.0)[0], path.path[0])
     np.testing.assert_allclose(motion(2.0)[0], path.q[-1])
+
+
+def test_a_path_and_its_motion_are_shown_in_one_line_each() -> None:
+    mechanism = srm.load("four_bar")
+    path = srm.follow(mechanism, {"crank": mechanism.q0[0] + np.linspace(0.0, 0.5, 40)})
+    assert repr(path) == (
+        f"FollowedPath('four_bar', 40 values reached, {len(path.path)} configurations, "
+        "0 singular, 'all values were reached')"
+    )
+    assert repr(path.motion(2.0)) == (
+        f"JointMotion('four_bar', t=0..2 s, {len(path.path)} configurations)"
+    )

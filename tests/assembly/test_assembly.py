@@ -800,3 +800,10 @@ def test_a_start_that_closures_determine_is_that_of_the_trust_region_solve(
     searched = srm.load(name)
     assert np.abs(contracted.q0 - searched.q0).max() < 1e-14
     assert np.abs(contracted.v0 - searched.v0).max() < 1e-12
+
+
+def test_a_state_is_shown_without_the_basis_of_its_motions() -> None:
+    shown = repr(srm.assemble(load("stewart_platform")))
+    assert shown.startswith("Assembly(q=array(")
+    assert "singular=False" in shown
+    assert "free_directions" not in shown

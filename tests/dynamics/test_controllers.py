@@ -96,6 +96,35 @@ def test_a_force_of_the_user_that_returns_a_mapping_is_told_what_it_returned(bac
         srm.simulate(mechanism, T_END, backend=backend)
 
 
+@pytest.mark.filterwarnings("ignore:Casting complex values")  # would be an error of its own
+@pytest.mark.parametrize("backend", ["python", "kernel"])
+@pytest.mark.parametrize("sample_time", [None, 0.01])
+@pytest.mark.parametrize("imaginary", [0.0, 2.0])
+def test_complex_forces_are_refused_as_other_wrong_ones_are(
+    backend: str, sample_time: float | None, imaginary: float
+) -> None:
+    mechanism = load("four_bar")
+    for given in (np.full(3, 1.0 + 1j * imaginary), [0.0, 1.0 + 1j * imaginary, np.complex128(0)]):
+        with pytest.raises(ControllerError, match=r"controller returned .*j.* must return 3 fin"):
+            srm.simulate(
+                mechanism,
+                T_END,
+                controller=lambda t, q, v: given,  # noqa: B023
+                sample_time=sample_time,
+                backend=backend,
+            )
+    pushed = replace(mechanism, forces=[srm.UserForce(lambda t, q, v: v + 1j * imaginary)])
+    with pytest.raises(ControllerError, match=r"force .* returned .*j.* must return 3 finite"):
+        srm.simulate(pushed, T_END, backend=backend)
+
+
+@pytest.mark.filterwarnings("ignore:Casting complex values")
+def test_a_simulator_takes_no_complex_forces() -> None:
+    simulator = srm.Simulator(load("four_bar"))
+    with pytest.raises(srm.InputError, match=r"tau = .* is not a vector of finite generalised"):
+        simulator.step(0.01, np.full(3, 1.0 + 2.0j))
+
+
 def test_a_joint_of_one_degree_of_freedom_takes_one_number() -> None:
     mechanism = load("four_bar")
     with pytest.raises(

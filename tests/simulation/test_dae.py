@@ -441,9 +441,17 @@ INVALID: dict[str, dict[str, Any]] = {
         f"{name} is complex": {"problem": problem_two(**{name: lambda t, x: x + 0.5j})}
         for name in ("f", "B", "G")
     },
+    **{
+        f"{name} is a list of complex numbers": {
+            "problem": problem_two(**{name: lambda t, x: [*(x + 0.5j)]})
+        }
+        for name in ("f", "B", "G")
+    },
+    "g is complex": {"problem": problem_two(g=lambda t, x: np.array([x @ x - 1.0 + 0.0j]))},
 }
 
 
+@pytest.mark.filterwarnings("ignore:Casting complex values")  # would be an error of its own
 def test_bad_input_is_refused_before_any_stepping() -> None:
     usual: dict[str, Any] = {"problem": problem_two(), "t_span": (0.0, 1.0), "x0": START_TWO}
     messages = {

@@ -267,7 +267,13 @@ def test_bad_steps_and_times_are_refused(slider_crank: srm.Mechanism, backend: s
     messages["q off the closures"] = refused(lambda: simulator.set_state(q + off))
     messages["v off the closures"] = refused(lambda: simulator.set_state(v=v + off))
     messages["q too short"] = refused(lambda: simulator.reset(q[:1]))
+    messages["v too short"] = refused(lambda: simulator.reset(v=v[:1]))
+    messages["q too short to be projected"] = refused(lambda: simulator.reset(q[:1], project=True))
+    messages["q of a reset off the closures"] = refused(lambda: simulator.reset(q + off, v))
+    messages["v of a reset off the closures"] = refused(lambda: simulator.reset(q, v + off))
     assert np.array_equal(simulator.q, q)
+    floating = srm.Simulator(floating_ring(), backend=backend)
+    messages["quaternion of length 2"] = refused(lambda: floating.reset(2.0 * floating.q))
     check_messages("simulator", messages)
 
 

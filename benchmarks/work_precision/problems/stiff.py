@@ -33,7 +33,6 @@ def _open_tree(mechanism: srm.Mechanism) -> Tree:
 def bushing() -> Problem:
     """The four-bar whose pin is an overdamped bushing."""
     mechanism = bushed_four_bar(TIME_CONSTANT)
-    start = np.concatenate([mechanism.q0, mechanism.v0])
     return Problem(
         "bushing",
         "Four-bar closed by an overdamped bushing, time constant 1e-6 s, 1 s",
@@ -42,7 +41,7 @@ def bushing() -> Problem:
         lambda: _open_tree(mechanism),
         state,
         rates=3,
-        reduced=ReducedModel(bushed_field(mechanism, TIME_CONSTANT), tuple(start)),
+        reduced=ReducedModel(bushed_field(mechanism, TIME_CONSTANT), tuple(mechanism.start_state)),
         stiff=True,
     )
 
@@ -114,6 +113,6 @@ def governor() -> Problem:
         lambda: _open_tree(loaded),
         state,
         rates=4,
-        reduced=ReducedModel(field, tuple(np.concatenate([loaded.q0, loaded.v0]))),
+        reduced=ReducedModel(field, tuple(loaded.start_state)),
         stiff=True,
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -192,14 +192,14 @@ class ErrorEstimate:
 
     fixed: bool
     trials: tuple[Trial, ...]
-    joints: tuple[JointDifference, ...]
+    joints: tuple[JointDifference, ...] = field(repr=False)
     size: float
     bound: bool
     order: float | None
     expected_order: float | None
     apart: float | None
     branch: float | None
-    comparison: Comparison
+    comparison: Comparison = field(repr=False)
 
 
 def checked_settings(solution: SimulationResult, rtol: float | None) -> list[float]:

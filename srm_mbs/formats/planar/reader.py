@@ -24,7 +24,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError, known_names, naming
+from srm_mbs.errors import AssemblyError, InputError, known_names, naming
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.graph.joint_graph import (
     Body,
@@ -354,6 +354,7 @@ class _Linkage:
             entries,
             tuple(self.notes()),
             check=self.check,
+            explain=self.explain,
             parts=plain_parts(bodies, joints) if model is None else None,
             model=model,
             vary=self.variants if model is None else None,
@@ -506,6 +507,10 @@ class _Linkage:
                     table[key] = values.tolist()
             yield {"joint": joint, **table}
 
+    def _unit(self, joint: str) -> str:
+        """The name of :meth:`_factor`."""
+        return self.entry.unit if joint in self.drawing.sliders else self.entry.angle
+
     def initial(self, angles: Mapping[str, float] | None = None) -> dict[str, Any]:
         """The table ``initial``, with the guessed ``angles`` of revolute joints, if they are known,
         by name."""
@@ -540,6 +545,32 @@ class _Linkage:
                 "they form a structure: the linkage has no degree of freedom",
                 "Remove a bar, or a point from ground, or let a pin slide",
             )
+
+    def explain(self, error: AssemblyError) -> None:
+        """Name the key of the section from which the part of ``initial`` was made that ``error`` is
+        about, unless the description has that part itself."""
+        entry, own = self.entry, self.options.own.get("initial", {})
+        if error.element == "initial.guess" and "guess" not in own:
+            error.element = f"{PLANAR}.points"
+            error.remedy = (
+                "Check the lengths, or draw the points closer to a closed pose; the closest one "
+                "found is in the error's q"
+            )
+        for part, key in (("q", "start"), ("v", "rates")):
+            given = getattr(entry, key)
+            if error.element != f"initial.{part}" or part in own:
+                continue
+            if given:
+                error.element = f"{PLANAR}.{key}"
+            elif entry.drive:
+                error.element = f"{PLANAR}.drive"
+        in_units = [
+            f"{name} = {value / self._factor(name):.9g} {self._unit(name)}"
+            for name, value in error.nearest.items()
+            if self._factor(name) != 1.0
+        ]
+        if in_units:
+            error.remedy += f" ({', '.join(in_units)})"
 
     # -- variants ------------------------------------------------------------------------------
 
@@ -766,6 +797,10 @@ class LinkageVariants:
     def check(self, mechanism: Mechanism) -> None:
         """Refuse a linkage that cannot move."""
         self._linkage.check(mechanism)
+
+    def explain(self, error: AssemblyError) -> None:
+        """Name what the section has."""
+        self._linkage.explain(error)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Without the checked section, whose tables may have classes made at run time."""

@@ -32,7 +32,7 @@ class CrankMark:
     loops: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class CrankPositions:
     """The data of a :class:`~srm_mbs.CrankMotion`, without the methods that show it."""
 
@@ -47,6 +47,13 @@ class CrankPositions:
     closed: bool
     marks: tuple[CrankMark, ...]
     transmission_angle: FloatArray | None
+
+    def __repr__(self) -> str:
+        motion = "turns fully" if self.turns else f"{len(self.dead_points)} dead points"
+        return (
+            f"CrankMotion({self.mechanism.name!r}, crank={self.crank!r}, {motion}, "
+            f"{len(self.singular_positions)} singular, {len(self.t)} configurations)"
+        )
 
     @property
     def unit(self) -> str:

@@ -237,7 +237,7 @@ class AnimationMixin:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class JointMotion(AnimationMixin):
     """Configurations of a mechanism over time.
 
@@ -273,6 +273,13 @@ class JointMotion(AnimationMixin):
                 remedy=f"Give increasing times (n,) and configurations (n, {nq})",
             )
 
+    def __repr__(self) -> str:
+        first, last = self.span
+        return (
+            f"JointMotion({self.mechanism.name!r}, t={first:.6g}..{last:.6g} s, "
+            f"{len(self.t)} configurations)"
+        )
+
     @property
     def span(self) -> tuple[float, float]:
         """Start and end (s)."""
@@ -304,7 +311,7 @@ class JointMotion(AnimationMixin):
         return (q[0], v[0]) if np.ndim(t) == 0 else (q, v)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class CrankMotion(CrankPositions, JointMotion):
     """All closed configurations of one branch, in order: the result of
     :func:`srm_mbs.kinematics`.

@@ -420,3 +420,7 @@ def test_a_certificate_reads_as_sentences() -> None:
         assert f"{found.topic} ({found.grade}): {found.text}" in text
         assert found.text.endswith(".")
     assert "grade='good'" in repr(certificate)
+    assert certificate.estimate is not None
+    shown = repr(certificate.estimate)
+    assert f"size={certificate.estimate.size!r}" in shown
+    assert "array(" not in shown

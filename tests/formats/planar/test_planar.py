@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import pickle
+import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -16,6 +18,7 @@ import tomli_w
 import srm_mbs as srm
 from srm_mbs.formats.load import models_folder
 from srm_mbs.formats.planar.shapes import fitted, outline, slender
+from srm_mbs.model.coordinates import position_of
 from tests.support.bundled import finished, load
 from tests.support.snapshots import check_messages, refused
 
@@ -486,6 +489,10 @@ def refusals() -> dict[str, Callable[[], object]]:
             lengths={("A", "B"): 110.0, ("B", "P"): 20.0, ("A", "P"): 20.0},
         ),
         "lengths that do not close": case(lengths={"coupler": 900.0}),
+        "start that does not close": case(start={"O": 0.1, "C": 0.1}, angle="deg"),
+        "start of every pin": case(start={"O": 0.1, "A": 0.1, "C": 0.1}),
+        "rates that do not close": case(rates={"O": 1.0, "C": 0.1}),
+        "drives that do not close": case(drives={"O": 1.0, "C": 2.0}),
         "unknown law": case(drives={"O": {"type": "fast"}}),
         "table of a file in degrees": case(
             drives={"O": {"type": "table", "table": "motion.csv"}}, angle="deg"
@@ -504,8 +511,9 @@ def test_refusals_name_the_point_or_bar() -> None:
 
 
 def test_refusals_of_a_description_name_its_file(tmp_path: Path) -> None:
+    tables = as_tables(**changed(FOUR_BAR, ground=["O", "C"]))
+
     def load_changed(**changes: Any) -> Callable[[], object]:
-        tables = as_tables(**changed(FOUR_BAR, ground=["O", "C"]))
         path = tmp_path / "linkage.toml"
 
         def call() -> object:
@@ -519,11 +527,43 @@ def test_refusals_of_a_description_name_its_file(tmp_path: Path) -> None:
         "floating base": load_changed(base="floating"),
         "point on an unknown link": load_changed(points={"tip": {"link": "X"}}),
         "point without a link": load_changed(points={"tip": {"xyz": [0.0, 0.0, 0.0]}}),
+        "start that does not close": load_changed(planar=tables["planar"] | {"start": {"C": 0.1}}),
+        "start that does not close, outside of the section": load_changed(
+            initial={"q": {"C": 0.1}}
+        ),
         "no points": load_changed(planar={"bar": [], "ground": []}),
         "unknown key": load_changed(planar={"points": {}, "bar": [], "ground": [], "bars": []}),
     }
     messages = {name: refused(call, tmp_path) for name, call in calls.items()}
     check_messages("planar_files", messages)
+
+
+@pytest.mark.parametrize(
+    ("base", "start", "moved", "unit"),
+    [
+        (changed(FOUR_BAR, angle="deg"), {"O": 0.1, "C": 0.1}, "C", math.pi / 180.0),
+        (changed(PRESS, sliders=RAM, unit="cm"), {"O": 0.9, "ram": 1.0}, "ram", 0.01),
+    ],
+    ids=["pins in degrees", "a slide in centimetres"],
+)
+def test_a_start_that_does_not_close_is_refused_with_one_in_its_units_that_does(
+    base: dict[str, Any], start: dict[str, float], moved: str, unit: float
+) -> None:
+    with pytest.raises(srm.AssemblyError) as caught:
+        made(base, start=start)
+    assert caught.value.element == "planar.start"
+    found = re.search(rf"\({moved} = (\S+) (deg|cm)\)", str(caught.value))
+    assert found is not None
+    linkage = made(base, start={"O": start["O"]})
+    closed = position_of(linkage, linkage.q0, moved)
+    assert unit * float(found[1]) == pytest.approx(closed, rel=1e-8)
+
+
+def test_a_variant_names_the_start_that_does_not_close() -> None:
+    linkage = made(start={"C": "=angle"}, parameters={"angle": 1.9})
+    with pytest.raises(srm.AssemblyError) as caught:
+        linkage.with_parameters(angle=0.1)
+    assert caught.value.element == "planar.start"
 
 
 def test_a_linkage_is_sent_to_other_processes() -> None:

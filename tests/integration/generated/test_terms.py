@@ -399,6 +399,35 @@ FORCES = {
 }
 
 
+DRIVES = (
+    srm.Drive(srm.Sine(0.2, frequency_hz=1.5), joint="j1"),
+    srm.Drive(srm.ConstantSpeed(0.7), joint="j4"),
+    srm.Drive(
+        srm.Polynomial((0.0, 0.4, 0.3)),
+        a=srm.Anchor("body_2", xyz=(0.3, 0.1, -0.2)),
+        b=srm.Anchor("world", rpy=(0.1, 0.4, -0.2)),
+        axis=(0.0, 0.6, 0.8),
+    ),
+    srm.Drive(
+        srm.MinimumJerk(0.1, duration=1.0),
+        a=srm.Anchor("body_3", xyz=(0.1, 0.2, 0.3)),
+        b=srm.Anchor("body_0", xyz=(0.0, 0.4, 0.1)),
+        distance=True,
+    ),
+)
+
+
+def test_drives_of_joints_and_points_with_friction_in_joints_are_those_of_the_kernel() -> None:
+    """One of them of a joint whose coordinates are a cosine and a sine."""
+    model = _chain()
+    joint = model.addJoint(4, pin.JointModelRUBY(), along_x(0.3), "j4")
+    model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
+    model.addBodyFrame("body_4", joint, pin.SE3.Identity(), 0)
+    model.damping = np.linspace(0.1, 0.5, model.nv)
+    model.friction = np.linspace(0.2, 0.4, model.nv)
+    _agree(srm.Mechanism(model, drives=DRIVES, q0=pin.neutral(model)))
+
+
 FORCES_ON_BODIES = ("spring", "spring without length", "rope", "wrench", "wrench of the link")
 
 

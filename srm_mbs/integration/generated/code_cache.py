@@ -15,6 +15,7 @@ import hashlib
 import importlib.util
 import os
 import platform
+import re
 import shlex
 import shutil
 import signal
@@ -68,8 +69,12 @@ PATIENCE = 120.0
 _ABANDONED = 3600.0
 """Age (s) of files without a library that no compilation can still be about to rename."""
 
-_COMPILER_FOLDER = "compiler"
+_COMPILER_FOLDER = "srm-mbs-compiler"
 """Folder of a compiler's own files in the cache."""
+_WORK = "srm-mbs-new-"
+"""Beginning of the names of files and folders that are not whole yet."""
+# The user may have named a folder that has other files, too.
+_OWN = re.compile(rf"[0-9a-f]{{64}}\.(so|sha256|lock)|{_WORK}.*|{_COMPILER_FOLDER}")
 _ZIG_FOLDERS = ("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR")
 _MESSAGES = "messages"
 """File with what a compiler says."""
@@ -147,7 +152,7 @@ def compiler() -> Compiler | None:
 
 def _at(path: str, arguments: list[str], folders: tuple[str, ...] = ()) -> Compiler | None:
     """The compiler that the program at ``path`` is."""
-    program = os.path.realpath(path)
+    path, program = os.path.abspath(path), os.path.realpath(path)  # it runs in another folder
     try:
         state = os.stat(program)
     except OSError:
@@ -189,6 +194,11 @@ def cache_folder() -> Path:
     XDG_CACHE_HOME or the system's folder for caches.
 
     The folder need not exist.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no home to put it in.
     """
     own = os.environ.get("SRM_MBS_CACHE", "")
     if os.path.isabs(own):
@@ -197,7 +207,12 @@ def cache_folder() -> Path:
     if os.path.isabs(given):
         base = Path(given)
     else:
-        base = Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
+        try:
+            home = Path.home()
+        except RuntimeError as error:
+            problem = "this user has no home, and SRM_MBS_CACHE names no folder for compiled code"
+            raise FileNotFoundError(problem) from error
+        base = home / ("Library/Caches" if sys.platform == "darwin" else ".cache")
     return base / "srm-mbs" / "code"
 
 
@@ -219,7 +234,7 @@ def _usable_folder() -> Path | None:
         folder = cache_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         unsafe = unsafe_reason(folder)
-    except (OSError, RuntimeError) as error:  # RuntimeError: no home
+    except OSError as error:
         unsafe = str(error)
     if unsafe is None:
         return folder
@@ -237,8 +252,11 @@ def _key(identity: str, chosen: Compiler) -> str:
 
 
 def _intact(library: Path) -> bool:
-    """Whether ``library`` is what was written there."""
+    """Whether ``library`` is what this user wrote there: others may have put files into a folder
+    that was open to them before."""
     try:
+        if library.lstat().st_uid != os.getuid():
+            return False
         return library.with_suffix(".sha256").read_text() == _digest(library.read_bytes())
     except (OSError, UnicodeDecodeError):
         return False
@@ -249,7 +267,7 @@ def keeps_any() -> bool:
     try:
         with os.scandir(cache_folder()) as entries:
             return any(entry.name.endswith(".so") for entry in entries)
-    except (OSError, RuntimeError):  # RuntimeError: no home
+    except OSError:
         return False
 
 
@@ -421,9 +439,9 @@ class Compilation:
         It lies in the cache, which is cleaned of the folders of killed processes, or where that has
         no room, elsewhere.
         """
-        for place, prefix in ((folder, "new-"), (None, "srm-mbs-")):
+        for place in (folder, None):
             try:
-                self._folder = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
+                self._folder = Path(tempfile.mkdtemp(prefix=_WORK, dir=place))
                 paths = [self._folder / f"{number}.c" for number in range(1, units + 1)]
                 for path in paths:
                     path.write_text(f"#define UNIT {path.stem}\n{source}" if units > 1 else source)
@@ -613,7 +631,7 @@ def _keep(made: Path, library: Path) -> Path | None:
 
 def _write(path: Path, content: bytes) -> None:
     """Write a file that appears whole or not at all."""
-    number, name = tempfile.mkstemp(dir=path.parent, prefix="new-")
+    number, name = tempfile.mkstemp(dir=path.parent, prefix=_WORK)
     try:
         with open(number, "wb") as file:
             file.write(content)
@@ -627,12 +645,12 @@ def _write(path: Path, content: bytes) -> None:
 def _shrink(folder: Path) -> None:
     """Remove what was used least recently, down to LARGEST, and what was abandoned."""
     found = []
-    for path in folder.iterdir():
+    for path in _own_files(folder):
         with suppress(OSError):  # others may remove files meanwhile
             state = path.stat()
             if path.suffix == ".so":
                 found.append((state.st_mtime, state.st_size, path))
-            elif path.name.startswith("new-") and time.time() - state.st_mtime > _ABANDONED:
+            elif path.name.startswith(_WORK) and time.time() - state.st_mtime > _ABANDONED:
                 _remove(path)
     total = sum(size for _, size, _ in found)
     for _, size, path in sorted(found):
@@ -641,6 +659,12 @@ def _shrink(folder: Path) -> None:
         _remove(path.with_suffix(".sha256"))
         _remove(path)
         total -= size
+
+
+def _own_files(folder: Path) -> list[Path]:
+    """Files and folders in ``folder`` that were made here; none where it does not exist."""
+    found = folder.iterdir() if folder.is_dir() else ()
+    return [path for path in found if _OWN.fullmatch(path.name)]
 
 
 def _remove(path: Path) -> None:
@@ -661,15 +685,11 @@ def clear() -> tuple[int, int]:
         If files cannot be removed.
     """
     count = size = 0
-    folder = cache_folder()
-    if not folder.is_dir():
-        return 0, 0
-    for path in folder.iterdir():
-        own = path.suffix in (".so", ".sha256", ".lock") or path.name == _COMPILER_FOLDER
-        if own or path.name.startswith("new-"):
+    for path in _own_files(cache_folder()):
+        with suppress(FileNotFoundError):  # a compilation that ends meanwhile removes its files
             size += _size(path)
-            count += path.suffix == ".so"
-            _remove(path)
+        count += path.suffix == ".so"
+        _remove(path)
     return count, size
 
 
@@ -681,6 +701,5 @@ def _size(path: Path) -> int:
 
 def contents() -> tuple[int, int]:
     """Number of libraries in the cache, and bytes."""
-    folder = cache_folder()
-    sizes = [path.stat().st_size for path in folder.glob("*.so")] if folder.is_dir() else []
+    sizes = [_size(path) for path in _own_files(cache_folder()) if path.suffix == ".so"]
     return len(sizes), sum(sizes)

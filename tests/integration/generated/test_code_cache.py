@@ -18,7 +18,7 @@ import srm_mbs as srm
 from srm_mbs.integration.generated import code_cache
 from srm_mbs.integration.generated.code_cache import CompilationError, compile_and_load
 from srm_mbs.integration.kernel import backend
-from tests.support.commands import row, run
+from tests.support.commands import error_line, row, run
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
@@ -77,7 +77,7 @@ def test_the_cache_is_the_users_alone(folder: Path) -> None:
     compile_and_load(SEVEN, _seven)
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert {stat.S_IMODE(path.stat().st_mode) & 0o077 for path in folder.iterdir()} == {0}
-    assert not [path for path in folder.iterdir() if path.name.startswith("new-")]
+    assert not [path for path in folder.iterdir() if path.name.startswith(code_cache._WORK)]
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o750, 0o702])
@@ -102,6 +102,60 @@ def test_a_folder_of_another_user_or_a_link_is_unsafe(
     uid = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: uid + 1)
     assert "belongs to another user" in str(code_cache.unsafe_reason(own))
+
+
+def test_a_library_of_another_user_is_not_loaded(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Others put it, with its digest, into the folder while it was open to them."""
+    assert compile_and_load(SEVEN, _seven)[1].path is not None
+    assert compile_and_load(SEVEN, _seven)[1].seconds == 0.0
+    uid = os.getuid()
+    monkeypatch.setattr(code_cache, "unsafe_reason", lambda _: None)
+    monkeypatch.setattr(os, "getuid", lambda: uid + 1)
+    assert compile_and_load(SEVEN, _seven)[1].seconds > 0.0
+
+
+def test_other_files_of_the_folder_are_neither_counted_nor_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The user may have named a folder that has some, the home for example."""
+    home = tmp_path / "home"
+    home.mkdir(mode=0o700)
+    monkeypatch.setenv("SRM_MBS_CACHE", str(home))
+    others = [home / name for name in ("libfoo.so", "poetry.lock", "image.sha256", "new-notes")]
+    for path in others:
+        path.write_text("mine")
+    for name in ("compiler", "new-project"):
+        (home / name).mkdir()
+        others += [home / name, home / name / "work.c"]
+        others[-1].write_text("mine")
+    for path in others:
+        os.utime(path, (0.0, 0.0))
+    monkeypatch.setattr(code_cache, "LARGEST", 0)  # all of its own has to go
+    compile_and_load(SEVEN, _seven)
+    assert all(path.exists() for path in others)
+    assert code_cache.contents() == (0, 0)
+    monkeypatch.setattr(code_cache, "LARGEST", 2**20)
+    compile_and_load(SEVEN, _seven)
+    assert code_cache.contents()[0] == 1
+    assert code_cache.clear()[0] == 1
+    assert sorted(home.rglob("*")) == sorted(others)
+
+
+def test_without_a_home_code_is_compiled_and_the_command_says_why_it_is_not_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", homeless)
+    value, made = compile_and_load(SEVEN, _seven)
+    assert (value, made.path) == (7, None)
+    assert not code_cache.keeps_any()
+    for arguments in (["cache"], ["cache", "--clear"]):
+        assert "this user has no home" in error_line(run(*arguments, status=2))
 
 
 def test_the_folder_can_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,10 +275,10 @@ def test_without_cc_the_compiler_of_the_package_ziglang_is_taken(
     monkeypatch.setattr(shutil, "which", lambda name, **more: None if name == "cc" else which(name))
     monkeypatch.delenv("ZIG_GLOBAL_CACHE_DIR", raising=False)
     assert compile_and_load(SEVEN, _seven)[0] == 7
-    assert seen.read_text() == f"cc {folder / 'compiler'}\n"
+    assert seen.read_text() == f"cc {folder / 'srm-mbs-compiler'}\n"
     # What it keeps there goes with the code.
-    (folder / "compiler").mkdir()
-    (folder / "compiler" / "libc").write_text("12345")
+    (folder / "srm-mbs-compiler").mkdir()
+    (folder / "srm-mbs-compiler" / "libc").write_text("12345")
     assert code_cache.clear()[0] == 1
     assert not list(folder.iterdir())
 
@@ -253,6 +307,22 @@ def test_the_last_line_of_a_compiler_that_fails_is_the_reason(program: Path) -> 
     _write_program(program, "echo first >&2; echo cannot do it >&2; exit 3")
     with pytest.raises(CompilationError, match=r"compiler failed: cannot do it"):
         compile_and_load(SEVEN, _seven)
+
+
+def test_a_compiler_may_be_named_relative_to_the_folder_of_the_program(
+    program: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It runs in the folder of its work."""
+    _write_program(program, f'exec {shutil.which("cc")} "$@"')
+    monkeypatch.chdir(program.parent)
+    monkeypatch.setenv("CC", f"./{program.name}")
+    assert compile_and_load(SEVEN, _seven)[0] == 7
+
+
+def test_warnings_of_a_compiler_do_not_matter(program: Path) -> None:
+    loud = "i=0; while [ $i -lt 3000 ]; do echo warning: $i; echo warning: $i >&2; i=$((i+1)); done"
+    _write_program(program, f'{loud}\nexec {shutil.which("cc")} "$@"')
+    assert compile_and_load(SEVEN, _seven)[0] == 7
 
 
 def test_a_compiler_that_makes_nothing_has_failed(program: Path) -> None:

@@ -315,7 +315,7 @@ def test_runs_go_on_with_the_kernel_where_the_compiler_fails(
     _no_code(mechanism)
     _no_code(_used("slider_crank"), 5)
     assert calls.read_text().count("\n") == 1  # it is asked once per process
-    assert not [path.name for path in folder.iterdir() if path.name.startswith("new-")]
+    assert not [path.name for path in folder.iterdir() if path.name.startswith(code_cache._WORK)]
 
 
 def test_runs_go_on_with_the_kernel_while_the_compiler_hangs(
@@ -595,7 +595,7 @@ def test_a_killed_process_leaves_the_code_to_others(
     os.killpg(int(calls.read_text()), signal.SIGKILL)
     program("exec CC")
     _runs(srm.load("four_bar"))
-    (left,) = folder.glob("new-*")
+    (left,) = folder.glob(f"{code_cache._WORK}*")
     long_ago = time.time() - 2.0 * code_cache._ABANDONED
     os.utime(left, (long_ago, long_ago))
     srm.compile(srm.load("slider_crank"))

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +15,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import make_system
+from srm_mbs.formats.urdf.joint_types import EXTENDED_TYPES, MULTIPLE
 from srm_mbs.integration.generated.algebra import algebra_of
 from srm_mbs.integration.generated.code import generated_source, load_code
 from srm_mbs.integration.generated.expressions import live_nodes
@@ -22,11 +24,13 @@ from srm_mbs.integration.generated.structure import UnsupportedElementError, str
 from srm_mbs.integration.generated.terms import GROUND, record_terms
 from srm_mbs.integration.kernel import backend
 from srm_mbs.integration.kernel.system import make_kernel_system
-from srm_mbs.model.forces import ForceElement
+from srm_mbs.model.closures import CLOSURE_TYPES
+from srm_mbs.model.forces import FORCE_TYPES, ForceElement
 from tests.support.bundled import load
 from tests.support.dynamics import mass_matrix, nonlinear_effects
 from tests.support.generated import GeneratedFunction, values_of
 from tests.support.mechanisms import COMPILED_MODELS, along_x, rod
+from tests.support.urdf_files import LINK
 
 pytestmark = [
     pytest.mark.skipif(backend.core is None, reason=f"no kernel: {backend.missing}"),
@@ -143,6 +147,56 @@ def test_mass_matrix_and_nonlinear_effects_are_pinocchios_for_any_kind_of_joint(
         assert np.abs(found.nle - nle).max() < 2e-14 * np.abs(nle).max()
 
 
+READ = {
+    "fixed": "",
+    "floating": "",
+    "planar": '<axis xyz="0 0 1"/>',
+    "spherical": "",
+    "universal": '<axis xyz="2 1 2"/><axis2 xyz="0 -3 4"/>',
+    "screw": '<axis xyz="0 3 4"/><thread_pitch value="0.3"/>',
+    **dict.fromkeys(("continuous", "revolute", "prismatic"), '<axis xyz="{}"/>'),
+}
+"""Types of joints of URDF and of its extensions, into which the other formats are translated, and
+what they need."""
+AXIAL = ("continuous", "revolute", "prismatic")
+AXES = ("1 0 0", "0 1 0", "0 0 1", "0 -1 0", "0.6 0 -0.8")
+
+
+def _read(folder: Path, kinds: Iterable[str]) -> srm.Mechanism:
+    """Chains of joints of these kinds as :func:`srm.load` reads them."""
+    out, parent = ['<robot name="all"><link name="base"/>'], "base"
+    for kind in kinds:
+        for i, axis in enumerate(AXES if "{}" in READ[kind] else [""]):
+            name = f"{kind}_{i}"
+            limit = '<limit lower="-2" upper="2" effort="1" velocity="1"/>'
+            out.append(LINK.format(name=name, mass=1.0 + 0.1 * len(out), y=0.05 * len(out)))
+            out.append(
+                f'<joint name="{name} joint" type="{kind}"><parent link="{parent}"/>'
+                f'<child link="{name}"/><origin xyz="0.1 0.2 -0.3" rpy="0.3 -0.4 0.5"/>'
+                f"{READ[kind].format(axis)}{limit if kind in ('revolute', 'prismatic') else ''}"
+                "</joint>"
+            )
+            parent = name
+    path = folder / "all.urdf"
+    path.write_text("".join([*out, "</robot>"]))
+    return srm.load(path)
+
+
+def test_terms_of_joints_of_every_type_that_is_read_are_pinocchios(tmp_path: Path) -> None:
+    assert {*EXTENDED_TYPES, *MULTIPLE} < READ.keys()
+    found: set[str] = set()
+    for kinds in (("floating", "planar", "spherical", "fixed"), ("universal", "screw"), AXIAL):
+        mechanism = _read(tmp_path, kinds)
+        function, model = GeneratedFunction(mechanism), mechanism.model
+        found |= {joint.shortname() for joint in model.joints}
+        for q, v in _states(mechanism, 3):
+            computed = function(q, v)
+            M, nle = mass_matrix(model, q), nonlinear_effects(model, q, v)
+            assert np.abs(computed.M - M).max() < 1e-14 * np.abs(M).max()
+            assert np.abs(computed.nle - nle).max() < 2e-14 * np.abs(nle).max()
+    assert len(found) > 12
+
+
 LENGTH = 1.3
 CLOSURES = {
     "point": {},
@@ -155,17 +209,18 @@ CLOSURES = {
     "point_on_line": {"axis": (0.0, 1.0, 0.0)},
     "point_on_plane": {"axis": (0.6, 0.0, 0.8)},
     "distance": {"length": LENGTH},
+    "coupling": {"joints": ("j3", "j1"), "polynomial": (0.0, -0.7, 0.3)},
 }
 
 
 def _chain() -> pin.Model:
-    """Two ball joints and a hinge between them, at angles."""
+    """Two ball joints and a hinge between them, at angles, and another hinge after them."""
     rng = np.random.default_rng(5)
     model = pin.Model()
     joint = 0
-    for i in range(3):
+    for i in range(4):
         at = pin.SE3(pin.rpy.rpyToMatrix(rng.uniform(-1, 1, 3)), rng.uniform(-1, 1, 3))
-        made = pin.JointModelRX() if i == 1 else pin.JointModelSpherical()
+        made = pin.JointModelRX() if i % 2 else pin.JointModelSpherical()
         joint = model.addJoint(joint, made, at, f"j{i}")
         model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
         model.addBodyFrame(f"body_{i}", joint, pin.SE3.Identity(), 0)
@@ -179,8 +234,9 @@ def _closed(kinds: Iterable[str], ground: bool) -> srm.Mechanism:
     b = srm.Anchor("world" if ground else "body_0", xyz=(0.2, -0.1, 0.4), rpy=(-0.4, 0.2, 0.9))
     # All of them can be closed at once: a is at b then, and its distance is to a point beside b.
     beside = replace(b, xyz=(b.xyz[0] + LENGTH, *b.xyz[1:]))
+    ends = {"distance": (a, beside), "coupling": ()}
     loops = [
-        srm.LoopClosure(kind, a, beside if kind == "distance" else b, name=kind, **CLOSURES[kind])
+        srm.LoopClosure(kind, *ends.get(kind, (a, b)), name=kind, **CLOSURES[kind])
         for kind in kinds
     ]
     return srm.Mechanism(model, loops, q0=pin.neutral(model))
@@ -188,6 +244,8 @@ def _closed(kinds: Iterable[str], ground: bool) -> srm.Mechanism:
 
 @pytest.mark.parametrize("ground", [pytest.param(True, marks=pytest.mark.stress), False])
 def test_rows_of_closures_are_those_of_the_reference(ground: bool) -> None:
+    """Of all types in one mechanism."""
+    assert CLOSURES.keys() == CLOSURE_TYPES.keys()
     mechanism = _closed(CLOSURES, ground)
     system, function = make_system(mechanism), GeneratedFunction(mechanism)
     for q, v in _states(mechanism, 5):
@@ -341,11 +399,41 @@ FORCES = {
 }
 
 
+DRIVES = (
+    srm.Drive(srm.Sine(0.2, frequency_hz=1.5), joint="j1"),
+    srm.Drive(srm.ConstantSpeed(0.7), joint="j4"),
+    srm.Drive(
+        srm.Polynomial((0.0, 0.4, 0.3)),
+        a=srm.Anchor("body_2", xyz=(0.3, 0.1, -0.2)),
+        b=srm.Anchor("world", rpy=(0.1, 0.4, -0.2)),
+        axis=(0.0, 0.6, 0.8),
+    ),
+    srm.Drive(
+        srm.MinimumJerk(0.1, duration=1.0),
+        a=srm.Anchor("body_3", xyz=(0.1, 0.2, 0.3)),
+        b=srm.Anchor("body_0", xyz=(0.0, 0.4, 0.1)),
+        distance=True,
+    ),
+)
+
+
+def test_drives_of_joints_and_points_with_friction_in_joints_are_those_of_the_kernel() -> None:
+    """One of them of a joint whose coordinates are a cosine and a sine."""
+    model = _chain()
+    joint = model.addJoint(4, pin.JointModelRUBY(), along_x(0.3), "j4")
+    model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
+    model.addBodyFrame("body_4", joint, pin.SE3.Identity(), 0)
+    model.damping = np.linspace(0.1, 0.5, model.nv)
+    model.friction = np.linspace(0.2, 0.4, model.nv)
+    _agree(srm.Mechanism(model, drives=DRIVES, q0=pin.neutral(model)))
+
+
 FORCES_ON_BODIES = ("spring", "spring without length", "rope", "wrench", "wrench of the link")
 
 
 @pytest.mark.parametrize("names", [tuple(FORCES)[:6], tuple(FORCES)[6:]])
 def test_forces_of_elements_are_those_of_the_kernel(names: tuple[str, ...]) -> None:
+    assert {force.type for force in FORCES.values()} == FORCE_TYPES.keys()
     plain = _closed(["point_on_plane"], True)
     forces = [replace(FORCES[name], name=name) for name in names]
     _agree(replace(plain, forces=forces))

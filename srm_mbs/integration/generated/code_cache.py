@@ -30,6 +30,8 @@ from functools import cache
 from pathlib import Path
 from typing import IO, NamedTuple, NoReturn, TypeVar
 
+from platformdirs import user_cache_path
+
 from srm_mbs.errors import get_logger
 
 try:
@@ -69,12 +71,10 @@ PATIENCE = 120.0
 _ABANDONED = 3600.0
 """Age (s) of files without a library that no compilation can still be about to rename."""
 
-_COMPILER_FOLDER = "srm-mbs-compiler"
-"""Folder of a compiler's own files in the cache."""
 _WORK = "srm-mbs-new-"
 """Beginning of the names of files and folders that are not whole yet."""
 # The user may have named a folder that has other files, too.
-_OWN = re.compile(rf"[0-9a-f]{{64}}\.(so|sha256|lock)|{_WORK}.*|{_COMPILER_FOLDER}")
+_OWN = re.compile(rf"[0-9a-f]{{64}}\.(so|sha256|lock)|{_WORK}.*")
 _ZIG_FOLDERS = ("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR")
 _MESSAGES = "messages"
 """File with what a compiler says."""
@@ -190,8 +190,8 @@ def processor() -> str:
 
 
 def cache_folder() -> Path:
-    """Where compiled code lies: the environment variable SRM_MBS_CACHE, else srm-mbs below
-    XDG_CACHE_HOME or the system's folder for caches.
+    """Where compiled code lies: the environment variable SRM_MBS_CACHE, else srm-mbs below the
+    user's folder for caches, on Linux XDG_CACHE_HOME or ~/.cache.
 
     The folder need not exist.
 
@@ -203,17 +203,14 @@ def cache_folder() -> Path:
     own = os.environ.get("SRM_MBS_CACHE", "")
     if os.path.isabs(own):
         return Path(own)
-    given = os.environ.get("XDG_CACHE_HOME", "")
-    if os.path.isabs(given):
-        base = Path(given)
-    else:
-        try:
-            home = Path.home()
-        except RuntimeError as error:
-            problem = "this user has no home, and SRM_MBS_CACHE names no folder for compiled code"
-            raise FileNotFoundError(problem) from error
-        base = home / ("Library/Caches" if sys.platform == "darwin" else ".cache")
-    return base / "srm-mbs" / "code"
+    problem = "this user has no home, and SRM_MBS_CACHE names no folder for compiled code"
+    try:
+        folder = user_cache_path("srm-mbs", appauthor=False) / "code"
+    except RuntimeError as error:
+        raise FileNotFoundError(problem) from error
+    if not folder.is_absolute():  # what older versions of platformdirs make of no home
+        raise FileNotFoundError(problem)
+    return folder
 
 
 def unsafe_reason(folder: Path) -> str | None:
@@ -470,8 +467,7 @@ class Compilation:
 
     def _run(self, command: Sequence[str], folder: Path) -> None:
         """Start a process in the ``folder`` of the source."""
-        own = folder if self._library is None else self._library.with_name(_COMPILER_FOLDER)
-        environment = {name: str(own) for name in self._compiler.folders} | os.environ
+        environment = {name: str(folder) for name in self._compiler.folders} | os.environ
         try:
             with open(folder / _MESSAGES, "ab") as messages:
                 process = subprocess.Popen(
@@ -566,7 +562,11 @@ class Compilation:
             return load(made), Compiled(self._seconds, kept)
         except ValueError as error:
             problem = f"the code that {name} made cannot be loaded: {error}"
-            raise CompilationError(problem, "Use another C compiler") from error
+            raise CompilationError(
+                problem,
+                "Use another C compiler, or name a folder in SRM_MBS_CACHE whose libraries may be "
+                "loaded: some file systems run nothing",
+            ) from error
 
     def end(self) -> None:
         """End the compiler, if it is at work, and remove its folder."""

@@ -51,6 +51,7 @@ from srm_mbs.errors import EvaluationError, EventError, InputError, safe_repr
 from srm_mbs.integration.dense_output import DenseOutput, step_data
 from srm_mbs.integration.methods.base import StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.model.numbers import real_array
 
 SAME_TIME_STEP = 1e-10
 """Times closer than this part of the step are one: a zero so close after the start of a run lies
@@ -168,7 +169,7 @@ class EventFunction:
             If it is anything but one finite number.
         """
         try:
-            value = np.asarray(found, dtype=float)
+            value = real_array(found, new=False)
         except Exception as error:
             self.fail(error, t)
         if value.size != 1 or not np.isfinite(value).all():

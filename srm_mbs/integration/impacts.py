@@ -85,7 +85,7 @@ def impact(
             element="restitution",
             remedy="Give 0 (nothing springs back) to 1 (all of it)",
         )
-    q, v = checked_start(mechanism.model, q, v)
+    q, v = checked_start(mechanism.model, q, v, ("q", "v"))
     remedy = f"Give {len(v)} numbers"
     n = finite_array(normal)
     if n is None:

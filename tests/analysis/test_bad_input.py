@@ -41,6 +41,8 @@ def test_what_cannot_be_analysed_is_refused(tmp_path: Path) -> None:
         "linearise: open loop": lambda: linearise(four, four.q0 + 0.1),
         "linearise: too many coordinates": lambda: linearise(four, coordinates=["crank", "rocker"]),
         "linearise: singular": lambda: linearise(beam, beam.q0),
+        "linearise: too few positions": lambda: linearise(four, four.q0[:-1]),
+        "linearise: too few rates": lambda: linearise(four, four.q0, four.v0[:-1]),
         "linearise: no step": lambda: linearise(four, step=0.0),
         "linearise: small step": lambda: linearise(four, step="small"),
         "mode shape: number": lambda: found.mode_shape(2),

@@ -356,9 +356,19 @@ def is_vector(t: float, q: Any, v: Any) -> Any:
     return v if t > 0.7 else 1.0
 
 
+def is_complex(t: float, q: Any, v: Any) -> Any:
+    return np.complex128(1.0 + 1.0j) if t > 0.7 else 1.0
+
+
+@pytest.mark.filterwarnings("ignore:Casting complex values")  # would be an error of its own
 @pytest.mark.parametrize(
     ("bad", "words"),
-    [(raises, "no light"), (is_nan, "returned nan"), (is_vector, "one finite number")],
+    [
+        (raises, "no light"),
+        (is_nan, "returned nan"),
+        (is_vector, "one finite number"),
+        (is_complex, "complex values"),
+    ],
 )
 def test_an_event_function_that_fails_ends_the_run_with_what_was_computed(
     slider_crank: srm.Mechanism, bad: Any, words: str

@@ -481,6 +481,7 @@ def test_bad_events_and_loops_are_refused(ball: srm.Mechanism) -> None:
         "terminal = -1": lambda: srm.simulate(ball, 1.0, events=floor(0.5, terminal=-1)),
         "with a loop twice": lambda: pinned.with_loop(pinned.loops[0]),
         "restitution above 1": lambda: srm.impact(ball, ball.q0, ball.v0, [1.0], 2.0),
+        "two rates of a ball": lambda: srm.impact(ball, ball.q0, [1.0, 2.0], [1.0]),
         "normal of another shape": lambda: srm.impact(ball, ball.q0, ball.v0, [1.0, 0.0]),
         "normal that nothing moves along": lambda: srm.impact(ball, ball.q0, ball.v0, [0.0]),
     }

@@ -16,7 +16,7 @@ from srm_mbs.integration.kernel.backend import backend
 from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
 from srm_mbs.model.mechanism import per_model
 from srm_mbs.model.numbers import finite_array
-from srm_mbs.model.validation import checked_start
+from srm_mbs.model.validation import STATE_ARGUMENTS, checked_start
 
 SMALLEST_GAIN = 1e-12
 """Response of n.v to an impulse along n, over that without closures, below which the closures do
@@ -85,7 +85,7 @@ def impact(
             element="restitution",
             remedy="Give 0 (nothing springs back) to 1 (all of it)",
         )
-    q, v = checked_start(mechanism.model, q, v, ("q", "v"))
+    q, v = checked_start(mechanism.model, q, v, STATE_ARGUMENTS)
     remedy = f"Give {len(v)} numbers"
     n = finite_array(normal)
     if n is None:

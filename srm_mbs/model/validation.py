@@ -274,6 +274,10 @@ def without(what: str, parts: Sequence[Part], name: str) -> tuple[Part, ...]:
     return kept
 
 
+STATE_ARGUMENTS = "q", "v"
+"""Names of a state where a function takes it, for :func:`checked_start`."""
+
+
 def checked_start(
     model: pin.Model, q0: Any, v0: Any, names: tuple[str, str] = ("q0", "v0")
 ) -> tuple[FloatArray, FloatArray]:

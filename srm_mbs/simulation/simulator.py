@@ -29,7 +29,7 @@ from srm_mbs.integration.messages import FailureCause
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.numbers import real_array
-from srm_mbs.model.validation import checked_start
+from srm_mbs.model.validation import STATE_ARGUMENTS, checked_start
 from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
 from srm_mbs.simulation.incremental_run import IncrementalRun, KernelRun, ReferenceRun
 from srm_mbs.simulation.options import (
@@ -58,8 +58,6 @@ MANY_STEPS = 100
 """Inner steps of one step, from which they are."""
 CHARGED = 0.05
 """Time (s) within steps after which it is counted for the policy of generated code."""
-ARGUMENTS = "q", "v"
-"""Names of the state where it is given."""
 BREAKPOINT_ROUNDING = 1e-14
 """Distance of a breakpoint from the end of a step that is rounding, over the time."""
 
@@ -372,7 +370,7 @@ class Simulator:
         self._pending_start = self.t, self._consistent(q, v, self.t, project)
 
     def _consistent(self, q: Any, v: Any, t: float, project: bool) -> FloatArray:
-        q, v = checked_start(self._mechanism.model, q, v, ARGUMENTS)
+        q, v = checked_start(self._mechanism.model, q, v, STATE_ARGUMENTS)
         if project:
             try:
                 given = self._mechanism.moved(q, v).start_state
@@ -385,7 +383,7 @@ class Simulator:
                 ) from error
             q, v = state[: self._nq], state[self._nq :]
         moved = self._mechanism.moved(q, v)
-        check_consistent(moved, t, names=ARGUMENTS)
+        check_consistent(moved, t, names=STATE_ARGUMENTS)
         return moved.start_state
 
     def clone(self) -> Simulator:

@@ -76,6 +76,8 @@ TURNED_BACK_COSINE = 0.9
 back or passed by."""
 TOUCHING_VALUE = 1e-6
 """Part of the values around below which such a motion touched the singular configuration."""
+UNTOUCHED_VALUE = 2.0 * TOUCHING_VALUE
+"""The same part from which a motion that turned back certainly did not."""
 VANISHING_TOGETHER = 2.0
 """Singular values up to this multiple of the smallest vanish with it."""
 RECORDED_DEPTH = 0.75
@@ -142,13 +144,18 @@ class ConstraintMonitor:
         self._tolerance = max(tolerance, ROUNDED_RESIDUAL)
         self.geometry = analysis.geometry(analysis.q0)
         self.rank = analysis.rank
-        self._analysis = analysis
-        self._dense = dense
+        self.analysis = analysis
+        self.dense = dense
         self._values = _singular_values(self.geometry.mechanism)
+        self._critical: dict[float, CriticalConfiguration | None] = {}
 
     def states(self, t: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """(q, v) at the times t (k,)."""
-        return [self._analysis.split(state) for state in self._dense(t)]
+        return [self.analysis.split(state) for state in self.dense(t)]
+
+    def configurations(self, t: FloatArray) -> FloatArray:
+        """q (k, nq) at the times t (k,)."""
+        return self.dense(t)[:, : self.geometry.model.nq]
 
     def place(self, t: float) -> FloatArray:
         """Configuration at t, as the geometry takes it."""
@@ -158,13 +165,18 @@ class ConstraintMonitor:
         """Last structural singular value of the normalised G at the times t (k,)."""
         if not len(t):
             return np.zeros(0)
-        q = self._dense(t)[:, : self.geometry.model.nq]
-        observables = self._dense.observables
+        q = self.configurations(t)
+        observables = self.dense.observables
         return observables.smallest_values(self.geometry, self._values, self.rank, t, q)
 
     def normalised(self, t: FloatArray) -> FloatArray:
         """The normalised G (k, rows, n) at the times t (k,)."""
         return self.geometry.normalised_rows(self._jacobians(t))
+
+    def separated(self, t: FloatArray, q: FloatArray) -> FloatArray:
+        """G (k, rows, n), of which :meth:`smallest` gives singular values, at the times t (k,) and
+        the configurations q (k, nq)."""
+        return self.geometry.separated_rows(self.dense.observables.jacobians(t, q))
 
     def near_null_spaces(self, G: FloatArray, active: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Null spaces of the ``active`` rows G (k, n) of the normalised ones that vanish at a
@@ -172,18 +184,19 @@ class ConstraintMonitor:
         return self._values.of_rows(active).near_null_spaces(G, self.rank)
 
     def _jacobians(self, t: FloatArray) -> FloatArray:
-        q = self._dense(t)[:, : self.geometry.model.nq]
-        return self._dense.observables.jacobians(t, q)
+        return self.dense.observables.jacobians(t, self.configurations(t))
 
     def critical(self, t: float) -> CriticalConfiguration | None:
         """The critical configuration next to the motion at t (s); None if there is none."""
-        return critical_configuration(
-            self.geometry,
-            self.rank,
-            self.place(t),
-            CROSSING_SEARCH,
-            jacobians=self._jacobians_at,
-        )
+        if t not in self._critical:
+            self._critical[t] = critical_configuration(
+                self.geometry,
+                self.rank,
+                self.place(t),
+                CROSSING_SEARCH,
+                jacobians=self._jacobians_at,
+            )
+        return self._critical[t]
 
     def is_regular(self, t: float, around: Sequence[float]) -> bool:
         """Whether the search for a critical configuration next to the motion at t (s) leaves its
@@ -201,7 +214,7 @@ class ConstraintMonitor:
         """As of the geometry, in one call of the observables."""
         nq = self.geometry.model.nq
         t = places[:, nq] if self.geometry.drives else np.zeros(len(places))
-        unscaled = self._dense.observables.jacobians(t, places[:, :nq])
+        unscaled = self.dense.observables.jacobians(t, places[:, :nq])
         return unscaled * (self.geometry.unit / self.geometry.row_unit[:, None])
 
     def counted_singular(self, t: float) -> FloatArray | None:
@@ -603,6 +616,75 @@ def _dips_in(
     return place[samples], own[k[chosen]]
 
 
+def _reversals(
+    monitor: ConstraintMonitor, scheme: ButcherTableau, steps: StepData, lowest: IndexArray
+) -> tuple[IndexArray, FloatArray, FloatArray]:
+    """Beside which of the recorded samples ``lowest`` (n,) all rates change their sign: their
+    indices (k,), and when (k,) s and where (k, nq) they do."""
+    own, unit = scheme.member(False), monitor.geometry.coordinate_unit
+    stages = len(own.distinct)
+    inner = np.flatnonzero((lowest > 1) & (lowest < stages * steps.count))
+    step, column = np.divmod(lowest[inner, None] + np.array([-2, -1, 0]), stages)
+    stage = own.distinct[column]
+    rates = steps.rates[step, stage, : len(unit)] / unit
+    change = rates[:, 2] - rates[:, 0]
+    size = np.linalg.norm(change, axis=1)
+    change /= size[:, None]
+    along = np.einsum("nij,nj->ni", rates, change)
+    across = (rates[:, ::2] ** 2).sum(axis=(1, 2)) - (along[:, ::2] ** 2).sum(axis=1)
+    turns = (along[:, 0] < 0.0) & (along[:, 2] > 0.0) & (across < (RESTING_SPEED * size) ** 2)
+    step, stage, along, change = step[turns], stage[turns], along[turns], change[turns]
+    t = steps.times[step] + own.abscissae[stage] * (steps.times[step + 1] - steps.times[step])
+    # Stages are less accurate than dense output, where one step of Newton's iteration follows.
+    (start, _, end), slope = t.T, (along[:, 2] - along[:, 0]) / (t[:, 2] - t[:, 0])
+    rest = np.clip(t[:, 1] - along[:, 1] / slope, start, end)
+    _, v = monitor.analysis.split(monitor.dense(rest))
+    rest = np.clip(rest - (v / unit * change).sum(axis=1) / slope, start, end)
+    return inner[turns], rest, monitor.configurations(rest)
+
+
+def _turned_back(
+    monitor: ConstraintMonitor, scheme: ButcherTableau, steps: StepData, recorded: RecordedDips
+) -> BoolArray:
+    """At which of the ``recorded`` minima (n,) the motion turned back before a singular
+    configuration without touching it: all rates change their sign, and the part of G that would
+    lose rank has the same one there as at the ends of the steps on both sides."""
+    dips, tops = np.array(recorded[1]), np.array(recorded[2])
+    out = np.zeros(len(dips), dtype=bool)
+    if monitor.geometry.drives or np.logical_or.reduce(steps.stiff):
+        return out
+    columns = scheme.member(False).distinct
+    stages = len(columns)
+    lowest = dips[:, 1]
+    first, last = np.maximum(dips[:, 0] - 1, 0) // stages, (dips[:, 2] - 1) // stages
+    alone = np.ones(len(dips), dtype=bool)
+    alone[1:] = lowest[:-1] < first[1:] * stages
+    alone[:-1] &= lowest[1:] > (last[:-1] + 1) * stages
+    own = np.flatnonzero(alone)
+    found, t, q = _reversals(monitor, scheme, steps, lowest[own])
+    if not len(found):
+        return out
+    found = own[found]
+    first, last, top = first[found], last[found], np.maximum(tops[found] - 1, 0)
+    q_first, q_last = (monitor.analysis.split(steps.states[end])[0] for end in (first, last + 1))
+    G = monitor.separated(
+        np.concatenate((t, steps.times[first], steps.times[last + 1])),
+        np.concatenate((q, q_first, q_last)),
+    )
+    G = G.reshape(3, len(found), *G.shape[1:])
+    left, values, right = np.linalg.svd(G[0])
+    k = monitor.rank - 1
+    value, before, after = np.einsum("ni,snij,nj->sn", left[:, :, k], G, right[:, k])
+    # The largest value of the window follows from the recorded sigmas.
+    largest = steps.sigmas[top // stages, columns[top % stages]] * np.maximum(
+        before / steps.sigmas[first, 0], after / steps.sigmas[last, -1]
+    )
+    single = values[:, :k].min(axis=1, initial=np.inf) > VANISHING_TOGETHER * value
+    same = (np.minimum(before, after) > 0.0) & (value > UNTOUCHED_VALUE * largest)
+    out[found] = single & same
+    return out
+
+
 def _times_around(
     t: FloatArray, first: int, k: int, last: int, width: int, count: int
 ) -> FloatArray:
@@ -764,7 +846,12 @@ def find_crossings(
     searches = []
     if recorded is not None:
         t, dips, tops = recorded
-        searches = [_crossings_at(monitor, steps, t, *one) for one in zip(dips, tops)]
+        turned = _turned_back(monitor, scheme, steps, recorded)
+        searches = [
+            _crossings_at(monitor, steps, t, dip, top)
+            for dip, top, back in zip(dips, tops, turned.tolist())
+            if not back
+        ]
     found: dict[float, Crossing] = {}
     for crossings in (*monitor.together(searches), _crossings_along_curves(monitor, steps)):
         for crossing in crossings:

@@ -628,10 +628,9 @@ def _reversals(
     stage = own.distinct[column]
     rates = steps.rates[step, stage, : len(unit)] / unit
     change = rates[:, 2] - rates[:, 0]
-    size = np.linalg.norm(change, axis=1)
-    change /= size[:, None]
+    size = (change**2).sum(axis=1)
     along = np.einsum("nij,nj->ni", rates, change)
-    across = (rates[:, ::2] ** 2).sum(axis=(1, 2)) - (along[:, ::2] ** 2).sum(axis=1)
+    across = size * (rates[:, ::2] ** 2).sum(axis=(1, 2)) - (along[:, ::2] ** 2).sum(axis=1)
     turns = (along[:, 0] < 0.0) & (along[:, 2] > 0.0) & (across < (RESTING_SPEED * size) ** 2)
     step, stage, along, change = step[turns], stage[turns], along[turns], change[turns]
     t = steps.times[step] + own.abscissae[stage] * (steps.times[step + 1] - steps.times[step])
@@ -676,11 +675,11 @@ def _turned_back(
     k = monitor.rank - 1
     value, before, after = np.einsum("ni,snij,nj->sn", left[:, :, k], G, right[:, k])
     # The largest value of the window follows from the recorded sigmas.
-    largest = steps.sigmas[top // stages, columns[top % stages]] * np.maximum(
-        before / steps.sigmas[first, 0], after / steps.sigmas[last, -1]
-    )
+    untouched = UNTOUCHED_VALUE * steps.sigmas[top // stages, columns[top % stages]]
     single = values[:, :k].min(axis=1, initial=np.inf) > VANISHING_TOGETHER * value
-    same = (np.minimum(before, after) > 0.0) & (value > UNTOUCHED_VALUE * largest)
+    same = np.minimum(before, after) > 0.0
+    for side, recorded_side in ((before, steps.sigmas[first, 0]), (after, steps.sigmas[last, -1])):
+        same &= value * recorded_side > untouched * side
     out[found] = single & same
     return out
 

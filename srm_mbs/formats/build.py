@@ -37,6 +37,7 @@ from srm_mbs.formats.plausibility import (
     SMALLEST_GYRATION,
     doubtful_angles,
     doubtful_inertias,
+    doubtful_rotations,
 )
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
 from srm_mbs.formats.toml.parameters import Place
@@ -479,13 +480,21 @@ def _are_plausible(bodies: Bodies | None) -> bool:
     )
 
 
-def _with_doubts(mechanism: Mechanism, description: Description) -> Mechanism:
-    """The mechanism with notes about values that look like those of other units, and about an axis
-    that keeps a loop from moving; warnings say the same."""
-    initial = description.initial
-    doubts = [
+def _doubtful_angles(mechanism: Mechanism, reading: Reading) -> list[str]:
+    """Sentences about angles that may be in degrees."""
+    initial = reading.description.initial
+    return [
         *doubtful_angles(mechanism, "initial.q", initial.q),
         *doubtful_angles(mechanism, "initial.guess", initial.guess),
+        *(() if reading.analysis is not None else doubtful_rotations(mechanism, reading.tree)),
+    ]
+
+
+def _with_doubts(mechanism: Mechanism, reading: Reading) -> Mechanism:
+    """The mechanism with notes about values that look like those of other units, and about an axis
+    that keeps a loop from moving; warnings say the same."""
+    doubts = [
+        *_doubtful_angles(mechanism, reading),
         *(() if _are_plausible(bodies_at_start(mechanism)) else doubtful_inertias(mechanism)),
     ]
     if mechanism.loops and mechanism.degrees_of_freedom == 0 and not mechanism.drives:
@@ -527,7 +536,9 @@ def assembled(reading: Reading) -> Mechanism:
     except AssemblyError as error:
         if reading.explain is not None:
             reading.explain(error)
-        error.remedy += _advice(error)
+        error.remedy = ". ".join(
+            (error.remedy + _advice(error), *_doubtful_angles(mechanism, reading))
+        )
         if description.lock:
             locked = ", ".join(map(repr, description.lock))
             error.remedy = f"{error.remedy}. Locked, so that they cannot help: {locked}"
@@ -540,7 +551,7 @@ def assembled(reading: Reading) -> Mechanism:
         )
     if reading.check is not None:
         reading.check(mechanism)
-    mechanism = _with_doubts(mechanism, description)
+    mechanism = _with_doubts(mechanism, reading)
     log.info(
         "%s: %d degrees of freedom, rank %d",
         mechanism.name,

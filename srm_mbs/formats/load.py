@@ -37,7 +37,7 @@ from srm_mbs.formats.variants import VARYING, KnownLinkage
 from srm_mbs.model.copies import copied
 from srm_mbs.model.mechanism import Source, SourceTexts, variant_maker
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array, name_list
-from srm_mbs.model.reach import Reach
+from srm_mbs.model.reach import Reach, folder_list
 
 log = get_logger(__name__)
 
@@ -535,7 +535,7 @@ def load(
         gravity,
         base,
         name_list(cut, "cut"),
-        tuple(mesh_dirs),
+        folder_list(mesh_dirs),
         allow_outside,
         keyframe,
         massless,

@@ -912,6 +912,8 @@ class FinishedRun:
         self.backend, self._passages = problem.backend, problem.passages
         self._kernel_system = None if shared(problem.system) else kernel_system
         self._record, self._counters = record, counters
+        if self._passages is not None and self._passages.examined:
+            self._passages.ended(record.end_of_steps().time)
         # Before anything reads the dense output, which evaluates stages.
         self._work = self._system.evaluations, self._system.factorisations
         self.controlled = options.controller is not None or self._system.has_user_forces

@@ -91,6 +91,11 @@ class Event:
         self.function, self.action = function, action
         self.direction, self.terminal = direction, terminal
 
+    def __repr__(self) -> str:
+        action = getattr(self.action, "__name__", self.action)
+        fixed = f"direction={self.direction!r}, terminal={self.terminal!r}"
+        return f"Event({self.__name__}, {fixed}, action={action})"
+
     def __call__(self, t: float, q: FloatArray, v: FloatArray) -> Any:
         """The value of the function."""
         return self.function(t, q, v)
@@ -576,7 +581,7 @@ def _acted(
     try:
         if isinstance(answer, Switch):
             return _switched(mechanism, answer, t, q, v)
-        q, v = (np.asarray(part, dtype=float) for part in answer)
+        q, v = _state(answer)
         moved = mechanism.continued(q, v)
         if moved.constrained:
             check_consistent(moved, t, backend)
@@ -585,6 +590,18 @@ def _acted(
         raise EventError(
             f"the action of the event {event.name!r} cannot be carried out: {error}"
         ) from error
+
+
+def _state(answer: Any) -> tuple[FloatArray, FloatArray]:
+    """q and v from the ``answer`` of an action."""
+    try:
+        q, v = (np.asarray(part, dtype=float) for part in answer)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"it returned {safe_repr(answer)}",
+            remedy="Return None, the state (q, v), or srm.Switch(mechanism)",
+        ) from error
+    return q, v
 
 
 def _curves_from(t: float, old: Mechanism, new: Mechanism) -> dict[str, Curve]:

@@ -201,7 +201,7 @@ class Simulator:
         self._last_dt = dt
         if self._pending_start is not None:
             if not np.isfinite(force).all():
-                raise _bad_force(tau)
+                raise _bad_force(tau, len(self._no_force))
             self._begin(*self._pending_start, force, dt)
         self._forces.append(force)
         if self._busy:
@@ -215,7 +215,7 @@ class Simulator:
             else:
                 self._piecewise(t, end, force)
         except ValueError as error:
-            raise _bad_force(tau) from error
+            raise _bad_force(tau, len(self._no_force)) from error
         except SimulationError as error:
             cause = failure_cause(self._mechanism, self.t, self.q, self._watch())
             if cause is None:
@@ -285,9 +285,9 @@ class Simulator:
         try:
             force = real_array(tau)  # the caller may change it afterwards
         except (TypeError, ValueError) as error:
-            raise _bad_force(tau) from error
+            raise _bad_force(tau, len(self._no_force)) from error
         if force.shape != self._no_force.shape:
-            raise _bad_force(tau)
+            raise _bad_force(tau, len(self._no_force))
         return force
 
     def _grid(self, length: float) -> float:
@@ -421,9 +421,9 @@ def _failed(t: float, cause: FailureCause) -> SimulationError:
     return SimulationError(f"Stopped at t = {t:.6g} s: {cause.clause}. {cause.remedy}.", None)
 
 
-def _bad_force(tau: Any) -> InputError:
+def _bad_force(tau: Any, size: int) -> InputError:
     return InputError(
         f"tau = {safe_repr(tau)} is not a vector of finite generalised forces",
         element="tau",
-        remedy="Give nv numbers or {joint: force}, N and N m",
+        remedy=f"Give {size} numbers or {{joint: force}}, N and N m",
     )

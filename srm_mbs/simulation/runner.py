@@ -702,7 +702,7 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
         handler.sample = sampler(system, problem.held, watch, controller, interval, kernel_system)
         handler.sample(t0, state)
     if evaluator is None:
-        memory = start(system, method, t0, state, norm, options.t_end)
+        memory = start(system, method, t0, state, norm, handler.end)
         memory.stiff = problem.stiff
         found = integrate_steps(
             system,
@@ -720,7 +720,7 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
         return found
     check_embedded(method.scheme, options.step)
     given = options.first_step or problem.last_step or None
-    first = first_stage(evaluator, method, t0, state, norm, options.t_end, problem.stiff)
+    first = first_stage(evaluator, method, t0, state, norm, handler.end, problem.stiff)
     try:
         run = _compiled_run(problem, kernel_system, first, given, handler)
     except ArithmeticError:  # the reference raises the error that says why

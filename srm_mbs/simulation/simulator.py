@@ -253,8 +253,12 @@ class Simulator:
         SimulationError
             If the first stage cannot be evaluated.
         """
+        smooth_until = math.inf
+        if not self._smooth:
+            after = t + BREAKPOINT_ROUNDING * (abs(t) + dt)
+            smooth_until = min(self._mechanism.breakpoints(after, math.inf), default=math.inf)
         try:
-            self._run.begin(t, state, force, dt)
+            self._run.begin(t, state, force, dt, smooth_until)
         except EvaluationError as error:
             raise SimulationError(f"Stopped at t = {t:.6g} s: {error}.", None) from error
         self._pending_start = None

@@ -18,6 +18,7 @@ from srm_mbs.dynamics.scaling import (
     numbers_of_tree,
     scene_diagonal,
 )
+from srm_mbs.formats.translation import FileTerms
 from srm_mbs.model.numbers import vector_elements
 
 LARGEST_START = 4.0 * math.pi
@@ -28,15 +29,20 @@ SMALLEST_GYRATION = 1e-3
 """The same over the size of the body, below which it is; point masses have none."""
 
 
-def doubtful_angles(mechanism: Mechanism, element: str, values: Mapping[str, Any]) -> Iterator[str]:
+def doubtful_angles(
+    mechanism: Mechanism, element: str, values: Mapping[str, Any], terms: FileTerms | None
+) -> Iterator[str]:
     """Sentences about angles among ``values`` of ``element``, joint -> position, that may be in
-    degrees."""
+    degrees; ``terms`` as of a :class:`~srm_mbs.formats.translation.Translation`."""
     for name, value in values.items():
         single = isinstance(value, int | float) and abs(value) > LARGEST_START
         if single and name in mechanism.joint_names and is_angle(mechanism.model, name):
+            given = None if terms is None else terms.written(name)
+            key, unit, factor = given or (element, "rad", 1.0)
+            degrees = f", and {value:g} degrees are {math.radians(value):.6g} rad"
             yield (
-                f"{element}: the angle {value:g} of the joint {name!r} is more than two turns: "
-                f"angles are in rad, and {value:g} degrees are {math.radians(value):.6g} rad"
+                f"{key}: the angle {value / factor:g} of the joint {name!r} is more than two "
+                f"turns: angles are in {unit}{degrees if unit == 'rad' else ''}"
             )
 
 

@@ -274,12 +274,12 @@ def without(what: str, parts: Sequence[Part], name: str) -> tuple[Part, ...]:
     return kept
 
 
-STATE_ARGUMENTS = "q", "v"
-"""Names of a state where a function takes it, for :func:`checked_start`."""
+START_ARGUMENTS, STATE_ARGUMENTS = ("q0", "v0"), ("q", "v")
+"""Names of an initial state, and of a state where a function takes it."""
 
 
 def checked_start(
-    model: pin.Model, q0: Any, v0: Any, names: tuple[str, str] = ("q0", "v0")
+    model: pin.Model, q0: Any, v0: Any, names: tuple[str, str] = START_ARGUMENTS
 ) -> tuple[FloatArray, FloatArray]:
     """Read-only copies of an initial state, q0 (nq,) and v0 (nv,), which messages call ``names``.
 

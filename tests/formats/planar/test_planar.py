@@ -566,6 +566,23 @@ def test_a_variant_names_the_start_that_does_not_close() -> None:
     assert caught.value.element == "planar.start"
 
 
+@pytest.mark.parametrize(
+    ("angle", "value", "said"),
+    [
+        ("rad", 30.0, "angle 30 of the joint 'O' .*: angles are in rad, and 30 degrees are 0.52"),
+        ("deg", 1000.0, "angle 1000 of the joint 'O' is more than two turns: angles are in deg$"),
+    ],
+)
+def test_a_start_of_more_than_two_turns_is_named_as_it_is_written(
+    angle: str, value: float, said: str
+) -> None:
+    with pytest.warns(srm.SrmWarning, match=rf"planar\.start: the {said}") as caught:
+        linkage = made(angle=angle, start={"O": "=turned"}, parameters={"turned": value})
+    assert len(caught) == 1
+    with pytest.warns(srm.SrmWarning, match=r"planar\.start: the angle \S+ of the joint 'O'"):
+        linkage.with_parameters(turned=1.01 * value)
+
+
 def test_a_linkage_is_sent_to_other_processes() -> None:
     linkage = made()
     copied = pickle.loads(pickle.dumps(linkage))

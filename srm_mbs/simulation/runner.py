@@ -71,7 +71,7 @@ from srm_mbs.integration.messages import (
 )
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, method_messages
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.methods.psrm import PSRM
+from srm_mbs.integration.methods.psrm import is_split
 from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
 from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.integration.singular_passages import (
@@ -589,7 +589,7 @@ def assemble_problem(
         if known is not None:
             problem.last_step = _repeated_step(before.end)
     # Sweeps say at the end what they met in their steps.
-    if options.t_eval is not None and isinstance(method, PSRM) and method.correction == "split":
+    if options.t_eval is not None and is_split(method):
         problem.stream = OutputStream(system, method.scheme, options.t_eval, by)
     return problem
 

@@ -41,7 +41,7 @@ from srm_mbs.formats.plausibility import (
 )
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
 from srm_mbs.formats.toml.parameters import Place
-from srm_mbs.formats.translation import NumbersOfVariants, TreeParts
+from srm_mbs.formats.translation import FileTerms, NumbersOfVariants, TreeParts
 from srm_mbs.formats.urdf.parser import UrdfModel, build_urdf, lock_joints
 from srm_mbs.formats.urdf.variants import OverridableTree
 from srm_mbs.formats.variants import Elements
@@ -202,17 +202,13 @@ class Reading:
         The texts of both.
     notes
         Sentences about approximations and ignored elements.
-    check
-        Of the assembled mechanism (:attr:`~srm_mbs.formats.translation.Translation.check`).
-    explain
-        As of :class:`~srm_mbs.formats.translation.Translation`.
     kind
         The class of the mechanism.
     variants
         Reads it again with other values of its parameters; None without parameters.
     analysis
         That of another variant of the description, if it is one.
-    parts, model, vary
+    file_terms, parts, model, vary
         As of :class:`~srm_mbs.formats.translation.Translation`.
     overridable
         The numbers of a URDF that its description changes, if variants may change them again.
@@ -225,8 +221,7 @@ class Reading:
     tree: Element
     source: Source
     notes: tuple[str, ...] = ()
-    check: Callable[[Mechanism], None] | None = None
-    explain: Callable[[AssemblyError], None] | None = None
+    file_terms: FileTerms | None = None
     kind: type[Mechanism] = Mechanism
     variants: VariantMaker | None = None
     analysis: ReusableAnalysis | None = None
@@ -482,10 +477,10 @@ def _are_plausible(bodies: Bodies | None) -> bool:
 
 def _doubtful_angles(mechanism: Mechanism, reading: Reading) -> list[str]:
     """Sentences about angles that may be in degrees."""
-    initial = reading.description.initial
+    initial, terms = reading.description.initial, reading.file_terms
     return [
-        *doubtful_angles(mechanism, "initial.q", initial.q),
-        *doubtful_angles(mechanism, "initial.guess", initial.guess),
+        *doubtful_angles(mechanism, "initial.q", initial.q, terms),
+        *doubtful_angles(mechanism, "initial.guess", initial.guess, terms),
         *(() if reading.analysis is not None else doubtful_rotations(mechanism, reading.tree)),
     ]
 
@@ -534,8 +529,8 @@ def assembled(reading: Reading) -> Mechanism:
         if joint is None:
             _analysed(mechanism, reading)
     except AssemblyError as error:
-        if reading.explain is not None:
-            reading.explain(error)
+        if reading.file_terms is not None:
+            reading.file_terms.explain(error)
         error.remedy = ". ".join(
             (error.remedy + _advice(error), *_doubtful_angles(mechanism, reading))
         )
@@ -549,8 +544,8 @@ def assembled(reading: Reading) -> Mechanism:
         raise _in_gimbal_lock(
             source, f"the joint {mechanism.model.names[joint]!r} moves no inertia there"
         )
-    if reading.check is not None:
-        reading.check(mechanism)
+    if reading.file_terms is not None:
+        reading.file_terms.check(mechanism)
     mechanism = _with_doubts(mechanism, reading)
     log.info(
         "%s: %d degrees of freedom, rank %d",

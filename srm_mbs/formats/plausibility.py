@@ -19,6 +19,7 @@ from srm_mbs.dynamics.scaling import (
     numbers_of_tree,
     scene_diagonal,
 )
+from srm_mbs.formats.translation import FileTerms
 from srm_mbs.model.numbers import vector_elements
 
 LARGEST_ANGLE = 4.0 * math.pi
@@ -29,13 +30,17 @@ SMALLEST_GYRATION = 1e-3
 """The same over the size of the body, below which it is; point masses have none."""
 
 
-def doubtful_angles(mechanism: Mechanism, element: str, values: Mapping[str, Any]) -> Iterator[str]:
+def doubtful_angles(
+    mechanism: Mechanism, element: str, values: Mapping[str, Any], terms: FileTerms | None
+) -> Iterator[str]:
     """Sentences about angles among ``values`` of ``element``, joint -> position, that may be in
-    degrees."""
+    degrees; ``terms`` as of a :class:`~srm_mbs.formats.translation.Translation`."""
     for name, value in values.items():
         single = isinstance(value, int | float) and abs(value) > LARGEST_ANGLE
         if single and name in mechanism.joint_names and is_angle(mechanism.model, name):
-            yield f"{element}: the angle {value:g} of the joint {name!r} {_in_degrees(value)}"
+            given = None if terms is None else terms.written(name)
+            key, unit, factor = given or (element, "rad", 1.0)
+            yield f"{key}: the angle {value / factor:g} of the joint {name!r} {_doubt(value, unit)}"
 
 
 def doubtful_rotations(mechanism: Mechanism, tree: Element) -> Iterator[str]:
@@ -52,14 +57,13 @@ def doubtful_rotations(mechanism: Mechanism, tree: Element) -> Iterator[str]:
     for element, angles in placed:
         largest = max(angles, key=abs, default=0.0)
         if abs(largest) > LARGEST_ANGLE:
-            yield f"{element}: the angle {largest:g} of rpy {_in_degrees(largest)}"
+            yield f"{element}: the angle {largest:g} of rpy {_doubt(largest, 'rad')}"
 
 
-def _in_degrees(angle: float) -> str:
-    return (
-        "is more than two turns: angles are in rad, and "
-        f"{angle:g} degrees are {math.radians(angle):.6g} rad"
-    )
+def _doubt(angle: float, unit: str) -> str:
+    """Why an ``angle`` (rad) that is written in ``unit`` is doubtful."""
+    degrees = f", and {angle:g} degrees are {math.radians(angle):.6g} rad" * (unit == "rad")
+    return f"is more than two turns: angles are in {unit}{degrees}"
 
 
 def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:

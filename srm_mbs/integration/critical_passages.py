@@ -36,7 +36,7 @@ from srm_mbs.integration.control.branch_guard import may_cross
 from srm_mbs.integration.control.placement import zero_within
 from srm_mbs.integration.methods.base import ErrorNorm, Method, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.methods.psrm import PSRM
+from srm_mbs.integration.methods.psrm import is_split
 from srm_mbs.model.lazy import cached_property
 
 SEARCH = 0.6
@@ -647,9 +647,8 @@ def examined_passages(
 ) -> CriticalPassages | None:
     """The examination of the passages of a run; None where steps make them all: without closures,
     without automatic placement, in sweeps and in large mechanisms."""
-    split = isinstance(method, PSRM) and method.correction == "split"
     branch_system = system.branch_system
-    if branch_system is None or not split or placement != "automatic":
+    if branch_system is None or not is_split(method) or placement != "automatic":
         return None
     if branch_system.nv > LARGEST:
         return None

@@ -34,6 +34,7 @@ from srm_mbs.integration.kernel.events import contact_probe
 from srm_mbs.integration.kernel.system import Evaluator, SuccessiveWorkspaces
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
+from srm_mbs.model.validation import STATE_ARGUMENTS
 from srm_mbs.simulation.options import RunOptions, positive
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.runner import (
@@ -584,7 +585,7 @@ def _acted(
         q, v = _state(answer)
         moved = mechanism.continued(q, v)
         if moved.constrained:
-            check_consistent(moved, t, backend)
+            check_consistent(moved, t, backend, names=STATE_ARGUMENTS)
         return moved, moved.q0, moved.v0
     except (InputError, EvaluationError, TypeError, ValueError) as error:
         raise EventError(
@@ -592,10 +593,10 @@ def _acted(
         ) from error
 
 
-def _state(answer: Any) -> tuple[FloatArray, FloatArray]:
-    """q and v from the ``answer`` of an action."""
+def _state(answer: Any) -> tuple[Any, Any]:
+    """q and v from the ``answer`` of an action, as they are."""
     try:
-        q, v = (np.asarray(part, dtype=float) for part in answer)
+        q, v = answer
     except (TypeError, ValueError) as error:
         raise InputError(
             f"it returned {safe_repr(answer)}",
@@ -631,12 +632,13 @@ def _switched(
             "a switch leads to something else than a mechanism with the same joints",
             remedy="Give a mechanism made from this one, for example with dataclasses.replace",
         )
-    new = new.with_state(q if switch.q is None else switch.q, v if switch.v is None else switch.v)
+    q, v = (q if switch.q is None else switch.q), (v if switch.v is None else switch.v)
+    new = new.with_state(q, v, STATE_ARGUMENTS)
     new = new.with_drive_curves(_curves_from(t, mechanism, new))
     given = new.start_state
     system = make_system(new)
     x = onto_closures(system, t, given)
     if system.position_norm(system.difference(given, x)) > LARGEST_PROJECTION:
-        check_consistent(new, t)
+        check_consistent(new, t, names=STATE_ARGUMENTS)
     nq = new.model.nq
     return new, x[:nq], x[nq:]

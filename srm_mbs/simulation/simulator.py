@@ -29,7 +29,7 @@ from srm_mbs.integration.messages import FailureCause
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.numbers import real_array
-from srm_mbs.model.validation import STATE_ARGUMENTS, checked_start
+from srm_mbs.model.validation import STATE_ARGUMENTS
 from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
 from srm_mbs.simulation.incremental_run import IncrementalRun, KernelRun, ReferenceRun
 from srm_mbs.simulation.options import (
@@ -374,7 +374,6 @@ class Simulator:
         self._pending_start = self.t, self._consistent(q, v, self.t, project)
 
     def _consistent(self, q: Any, v: Any, t: float, project: bool) -> FloatArray:
-        q, v = checked_start(self._mechanism.model, q, v, STATE_ARGUMENTS)
         if project:
             try:
                 given = self._mechanism.moved(q, v).start_state

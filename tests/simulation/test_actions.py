@@ -465,6 +465,29 @@ def test_a_bad_action_ends_the_run_with_everything_kept(
     assert solution.t[-1] == pytest.approx(np.sqrt(2.0 / G))
 
 
+@pytest.mark.filterwarnings("ignore:Casting complex values")  # would be an error of its own
+@on_both
+@pytest.mark.parametrize("imaginary", [0.0, 2.0])
+@pytest.mark.parametrize("place", [0, 1], ids=["q", "v"])
+def test_a_complex_state_from_an_action_is_refused_as_other_wrong_ones_are(
+    ball: srm.Mechanism, place: int, imaginary: float, backend: str
+) -> None:
+    factors = [1.0, 1.0]
+    factors[place] = 1.0 + 1j * imaginary
+    of_q, of_v = factors
+    for action in (
+        lambda t, q, v: (of_q * q, of_v * v),
+        lambda t, q, v: ([of_q * q[0]], [of_v * v[0]]),
+        lambda t, q, v: srm.Switch(ball, q=of_q * q, v=of_v * v),
+    ):
+        event = srm.Event(height, direction=-1, action=action)
+        solution = srm.simulate(ball, 2.0, events=event, backend=backend)
+        assert solution.status == "failed"
+        name = "qv"[place]
+        said = f"cannot be carried out: {name}: {name} does not consist of 1 finite numbers"
+        assert f"the action of the event 'height' {said}" in solution.message
+
+
 def test_a_switch_to_closures_that_are_open_is_refused() -> None:
     wheels = flywheels()
     clutch = srm.LoopClosure("coupling", joints=("a", "b"), ratio=1.0, name="clutch")

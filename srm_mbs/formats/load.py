@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
-from numbers import Integral
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -36,7 +35,7 @@ from srm_mbs.formats.urdf.variants import OverridableTree
 from srm_mbs.formats.variants import VARYING, KnownLinkage
 from srm_mbs.model.copies import copied
 from srm_mbs.model.mechanism import Source, SourceTexts, variant_maker
-from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array, name_list
+from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array, name_list, positive_integer
 from srm_mbs.model.reach import Reach
 
 log = get_logger(__name__)
@@ -610,10 +609,5 @@ def n_four_bar(n: int) -> Mechanism:
     InputError
         If n < 1 or n > 1000 (300 without the compiled kernel).
     """
-    if not isinstance(n, Integral) or n < 1:
-        raise InputError(
-            f"an N-four-bar needs n >= 1, not {safe_repr(n)}",
-            element="n",
-            remedy="Give a positive integer",
-        )
-    return assembled(_generated(int(n), Overrides()))
+    loops = positive_integer(n, "n", "Give the number of loops", " of loops")
+    return assembled(_generated(loops, Overrides()))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -202,6 +203,48 @@ def finite_number(
             remedy=remedy,
         )
     return float(array)
+
+
+def positive_number(
+    value: Any, name: str, unit: str = "", remedy: str = "Give a positive number"
+) -> float:
+    """``value``, the argument ``name``, as a positive finite float; messages say its ``unit``, such
+    as ``" of seconds"``.
+
+    Raises
+    ------
+    InputError
+        With that ``remedy``, if it is anything else.
+    """
+    try:
+        number = float(value)
+    except Exception:  # objects may raise anything
+        number = math.nan
+    if not (math.isfinite(number) and number > 0.0):
+        raise InputError(
+            f"{name} = {safe_repr(value)} is not a positive number{unit}",
+            element=name,
+            remedy=remedy,
+        )
+    return number
+
+
+def positive_integer(value: Any, name: str, remedy: str, unit: str = "") -> int:
+    """``value``, the argument ``name``, as an integer of at least 1; ``unit`` as of
+    :func:`positive_number`.
+
+    Raises
+    ------
+    InputError
+        With that ``remedy``, if it is anything else, True included.
+    """
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+        raise InputError(
+            f"{name} = {safe_repr(value)} is not a positive whole number{unit}",
+            element=name,
+            remedy=remedy,
+        )
+    return int(value)
 
 
 def _is_finite_float(value: Any) -> bool:

@@ -22,7 +22,7 @@ from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM
 from srm_mbs.integration.methods.tableaus import get_tableau
 from srm_mbs.integration.methods.thesis.srm import SRM
-from srm_mbs.model.numbers import choice, finite_array, finite_number, flag
+from srm_mbs.model.numbers import choice, finite_array, finite_number, flag, positive_number
 
 LOOSEST_RTOL = 1e-4
 """Looser tolerances let sweeps jump to another branch at a change point."""
@@ -123,7 +123,7 @@ class RunOptions(NamedTuple):
         t0, t_end = span
         for name in ("step", "first_step", "max_step"):
             if getattr(self, name) is not None:
-                positive(getattr(self, name), name, unit)
+                positive_number(getattr(self, name), name, unit)
         check_progress(self.progress, arguments)
         return self._replace(
             t0=t0,
@@ -169,21 +169,6 @@ _REPEATABLE = itemgetter(
     )
 )
 """The values of the options of a rerun, from those of a run and :data:`_NOT_REPEATED`."""
-
-
-def positive(value: Any, what: str, unit: str = "") -> float:
-    """``value`` as a positive finite float."""
-    try:
-        number = float(value)
-    except Exception:  # objects may raise anything
-        number = math.nan
-    if not (math.isfinite(number) and number > 0.0):
-        raise InputError(
-            f"{what} = {safe_repr(value)} is not a positive number{unit}",
-            element=what,
-            remedy="Give a positive number",
-        )
-    return number
 
 
 def checked_singular_tolerance(value: Any) -> float:
@@ -262,7 +247,7 @@ def checked_rtol(
 ) -> float:
     """rtol within what the methods can use, from ``tightest`` to ``loosest``; warns where it is
     changed."""
-    rtol = positive(value, "rtol")
+    rtol = positive_number(value, "rtol")
     if rtol > loosest:
         warn(
             f"rtol = {rtol:g} is looser than {loosest:g}, from where a step may jump to "
@@ -387,7 +372,7 @@ def checked_span(t0: Any, t_end: Any) -> tuple[float, float]:
     """Start and end (s) of a run."""
     start = finite(t0, "t0")
     if start == 0.0:
-        return 0.0, positive(t_end, "t_end", " of seconds")
+        return 0.0, positive_number(t_end, "t_end", " of seconds")
     end = finite(t_end, "t_end")
     if not end > start:
         raise InputError(
@@ -403,7 +388,7 @@ def checked_samples(sample_time: Any, controller: Any, t0: float, t_end: float) 
     none."""
     if sample_time is None:
         return _NO_TIMES
-    period = positive(sample_time, "sample_time", " of seconds")
+    period = positive_number(sample_time, "sample_time", " of seconds")
     if controller is None:
         raise InputError(
             "sample_time is given, but no controller",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.errors import InputError, known_names, safe_repr
 
 LARGEST_MAGNITUDE = 1e30
 """Largest magnitude of a number in a file, in SI units: the squares of larger ones may overflow in
@@ -117,7 +117,7 @@ def choice(value: Any, known: Iterable[str], name: str) -> str:
     raise InputError(
         f"there is no {name} {safe_repr(value)}",
         element=name,
-        remedy=f"Known: {', '.join(map(repr, words))}",
+        remedy=known_names(words),
     )
 
 

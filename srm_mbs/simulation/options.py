@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, safe_repr, warn
+from srm_mbs.errors import InputError, known_names, safe_repr, warn
 from srm_mbs.integration.control.prescribed_times import PLACEMENTS
 from srm_mbs.integration.methods.base import NEGLIGIBLE, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -274,7 +274,7 @@ def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -
             raise InputError(
                 f"there is no method {safe_repr(method)}",
                 element="method",
-                remedy=f"Known: {', '.join(repr(name) for name in METHODS)}",
+                remedy=known_names(METHODS),
             )
         if tableau is not None:
             get_tableau(tableau)  # refuses what cannot be looked up

@@ -16,7 +16,7 @@ from uuid import uuid4
 
 from srm_mbs.api import simulate
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError, get_logger, safe_repr
+from srm_mbs.errors import InputError, get_logger, known_names, safe_repr
 from srm_mbs.model.numbers import positive_integer
 from srm_mbs.simulation.monitoring import Counted, counting
 from srm_mbs.simulation.options import check_progress, checked_span
@@ -189,7 +189,7 @@ def _check_options(options: Mapping[str, Any]) -> None:
             raise InputError(
                 f"there is no option {name!r}",
                 element=name,
-                remedy=f"Known: {', '.join(sorted(known - set(_REFUSED_OPTIONS)))}",
+                remedy=known_names(sorted(known - set(_REFUSED_OPTIONS))),
             )
     mechanism_method(options.get("method", "psrm"), options.get("tableau"))
 

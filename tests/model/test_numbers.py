@@ -41,7 +41,7 @@ def test_a_speed_that_is_no_positive_number_is_refused(value: Any) -> None:
     run = srm.simulate(srm.load("simple_pendulum"), 0.1)
     with pytest.raises(srm.InputError, match="is not a positive number"):
         run.export_video("film.gif", speed=value)
-    with pytest.raises(srm.InputError, match="speed = .* is not a positive number of m/s"):
+    with pytest.raises(srm.InputError, match=r"speed = .* is not a positive number of m/s"):
         positive_number(value, "speed", " of m/s")
 
 

@@ -18,9 +18,9 @@ from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.tableaus import check_explicit
 from srm_mbs.integration.methods.thesis.iterated_sweeps import First, IteratedSweeps
 from srm_mbs.integration.methods.thesis.regularisation import Regularisation, parse_eps
-from srm_mbs.integration.methods.thesis.sweep import checked_regulariser, interpolant
+from srm_mbs.integration.methods.thesis.sweep import REGULARISERS, interpolant
 from srm_mbs.model.lazy import cached_property
-from srm_mbs.model.numbers import flag, positive_integer
+from srm_mbs.model.numbers import choice, flag, positive_integer
 
 LARGEST_CARRIED = 3
 """Number of sweeps up to which restarting with the carried multiplier is stable (measured)."""
@@ -112,7 +112,7 @@ class SRM(DelegatingMethod):
                 element="iterations",
                 remedy=f"Use at most {LARGEST_CARRIED} sweeps, or carry=False",
             )
-        checked_regulariser(self.T)
+        choice(self.T, REGULARISERS, "T")
         self.stepper  # noqa: B018 - bad eps or interpolation is refused now
 
     @cached_property

@@ -30,7 +30,7 @@ from srm_mbs.dynamics.singularities.local_analysis import TAU
 from srm_mbs.errors import InputError, get_logger, safe_repr
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.model.lazy import cached_property
-from srm_mbs.model.numbers import positive_integer, positive_number
+from srm_mbs.model.numbers import finite_number, positive_integer, positive_number
 from srm_mbs.model.validation import STATE_ARGUMENTS, checked_start
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 
@@ -144,8 +144,8 @@ class Linearisation:
         Raises
         ------
         InputError
-            If there is no such mode, the mechanism cannot move that far, or ``frames`` is not
-            positive.
+            If there is no such mode, the mechanism cannot move that far, ``amplitude`` is no finite
+            number, or ``frames`` no positive integer.
         """
         frames = positive_integer(frames, "frames", f"Give a positive number, for example {FRAMES}")
         count = len(self.eigenvalues)
@@ -155,6 +155,7 @@ class Linearisation:
                 element="mode",
                 remedy=f"Give 0 to {count - 1}",
             )
+        amplitude = finite_number(amplitude, "amplitude", "amplitude")
         mode = int(mode)
         turning = abs(float(self.eigenvalues[mode].imag))
         period = 2.0 * np.pi / turning if turning > 0.0 else 1.0

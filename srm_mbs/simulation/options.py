@@ -242,9 +242,7 @@ def tightest_rtol(scheme: ButcherTableau, constrained: bool) -> float:
     return next(rtol for least, rtol in TIGHTEST_OF_CLOSURES.items() if order >= least)
 
 
-def checked_rtol(
-    value: Any, loosest: float = LOOSEST_RTOL, tightest: float = float(TIGHTEST_RTOL)
-) -> float:
+def checked_rtol(value: Any, loosest: float, tightest: float) -> float:
     """rtol within what the methods can use, from ``tightest`` to ``loosest``; warns where it is
     changed."""
     rtol = positive_number(value, "rtol")

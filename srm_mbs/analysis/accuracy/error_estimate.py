@@ -242,7 +242,7 @@ def estimate_error(
     solution: SimulationResult,
     settings: list[float],
     samples: Sequence[Samples],
-    progress: Any = False,
+    progress: Any,
 ) -> ErrorEstimate | str:
     """Repeat ``solution`` at each of ``settings``, and compare; or the reason why that failed.
 

@@ -106,9 +106,9 @@ def report_page(
     solution: SimulationResult,
     certificate: Certificate,
     *,
-    animation: bool = True,
-    pictures: Sequence[str] = tuple(PICTURES),
-    full_paths: bool = False,
+    animation: bool,
+    pictures: Sequence[str],
+    full_paths: bool,
 ) -> str:
     """The page of :func:`write_report`."""
     player = None

@@ -260,10 +260,10 @@ class Embedded:
 def show_in_notebook(
     solution: DrawableMotion,
     *,
-    height: int = 420,
-    fps: float = 60.0,
-    view: ViewOptions = NO_OVERLAYS,
-    panel: bool = True,
+    height: int,
+    fps: float,
+    view: ViewOptions,
+    panel: bool,
 ) -> Embedded:
     """The animation of a run as the value of a notebook cell.
 

@@ -65,7 +65,7 @@ DAE_KINDS: Kinds = {"run": draw_dae_run, "state": draw_dae_state}
 """Kinds of plots of a run of a DAE."""
 
 
-def check_options(kind: str, options: Iterable[str] = (), kinds: Kinds = KINDS) -> None:
+def check_options(kind: str, options: Iterable[str], kinds: Kinds = KINDS) -> None:
     """Refuse an unknown kind of plot, or options that it does not have.
 
     Raises

@@ -28,7 +28,8 @@ from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.model.lazy import cached_property
-from srm_mbs.simulation.options import numbers, positive
+from srm_mbs.model.numbers import positive_number
+from srm_mbs.simulation.options import numbers
 from srm_mbs.simulation.result import SimulationResult
 
 MOTION_TOLERANCE = 1e-6
@@ -173,7 +174,7 @@ def inverse_dynamics(
         the actuated joints cannot exert.
     """
     check_mechanism(mechanism)
-    tolerance = positive(tolerance, "tolerance")
+    tolerance = positive_number(tolerance, "tolerance")
     mechanism = mechanism.undriven  # the actuators replace the drives
     times, q, v, a = _motion(mechanism, motion, t)
     names = mechanism.joint_names if actuated is None else actuated

@@ -30,8 +30,8 @@ from srm_mbs.dynamics.singularities.local_analysis import TAU
 from srm_mbs.errors import InputError, get_logger, safe_repr
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.model.lazy import cached_property
+from srm_mbs.model.numbers import finite_number, positive_integer, positive_number
 from srm_mbs.model.validation import STATE_ARGUMENTS
-from srm_mbs.simulation.options import positive
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 log = get_logger(__name__)
@@ -144,15 +144,10 @@ class Linearisation:
         Raises
         ------
         InputError
-            If there is no such mode, the mechanism cannot move that far, or ``frames`` is not
-            positive.
+            If there is no such mode, the mechanism cannot move that far, ``amplitude`` is no finite
+            number, or ``frames`` no positive integer.
         """
-        if not isinstance(frames, Integral) or frames < 1:
-            raise InputError(
-                f"frames = {safe_repr(frames)} is not a positive whole number",
-                element="frames",
-                remedy=f"Give a positive number, for example {FRAMES}",
-            )
+        frames = positive_integer(frames, "frames", f"Give a positive number, for example {FRAMES}")
         count = len(self.eigenvalues)
         if not isinstance(mode, Integral) or not -count <= mode < count:
             raise InputError(
@@ -160,6 +155,7 @@ class Linearisation:
                 element="mode",
                 remedy=f"Give 0 to {count - 1}",
             )
+        amplitude = finite_number(amplitude, "amplitude", "amplitude")
         mode = int(mode)
         turning = abs(float(self.eigenvalues[mode].imag))
         period = 2.0 * np.pi / turning if turning > 0.0 else 1.0
@@ -238,7 +234,7 @@ def linearise(
     """
     check_mechanism(mechanism)
     mechanism.refuse_drives("a linearisation")
-    step = positive(step, "step")
+    step = positive_number(step, "step")
     if q is None:
         q, v = mechanism.q0, mechanism.v0 if v is None else v
     v = np.zeros(mechanism.model.nv) if v is None else v

@@ -87,7 +87,7 @@ def _description_path(out: str | Path) -> Path:
 
 
 def write_description(
-    reading: Reading, out: str | Path, *, inputs: Sequence[str | Path] = (), force: bool = False
+    reading: Reading, out: str | Path, *, inputs: Sequence[str | Path] = (), force: bool
 ) -> tuple[Path, Path, tuple[str, ...]]:
     """Write what was read as a description, and its tree as a URDF beside it.
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, known_names
 from srm_mbs.formats import gepetto
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.files import shortened
@@ -107,7 +107,7 @@ def find_format(path: Path, document: Document) -> Format:
     raise InputError(
         f"{what} is not of a format that is read",
         file=str(path),
-        remedy=f"Known: {', '.join(known.name for known in FORMATS)}",
+        remedy=known_names(known.name for known in FORMATS),
     )
 
 

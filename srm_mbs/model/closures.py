@@ -31,7 +31,7 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
-from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
 from srm_mbs.model.copies import copied, short_repr
 from srm_mbs.model.lazy import cached_property
@@ -398,7 +398,7 @@ class LoopClosure:
         if not (known or isinstance(self.type, ClosureType)):
             raise self._fault(
                 f"there is no closure type {safe_repr(self.type)}",
-                f"Known: {', '.join(CLOSURE_TYPES)}",
+                known_names(CLOSURE_TYPES),
             )
         kind = self.kind
         if not known:
@@ -430,7 +430,7 @@ class LoopClosure:
                 raise self._fault(
                     f"the closure type {safe_repr(kind.name)} needs or takes {safe_repr(key)}, "
                     "which closures do not have",
-                    f"Known: {', '.join(keys)}",
+                    known_names(keys),
                 )
 
     def between(self, a: Anchor, b: Anchor) -> LoopClosure:
@@ -454,7 +454,7 @@ class LoopClosure:
             if label not in known:
                 raise self._fault(
                     f"a {self.kind.name} closure has no row {safe_repr(label)}",
-                    f"Known: {', '.join(known)}",
+                    known_names(known),
                 )
         if labels and set(labels) == set(known):
             raise self._fault("all its rows are left out", "Remove the closure")

@@ -223,7 +223,7 @@ def run_segment(
     options: RunOptions,
     result_type: type[Result],
     workspaces: SuccessiveWorkspaces,
-    before: Segment[Result] | None = None,
+    before: Segment[Result] | None,
 ) -> Segment[Result]:
     """A segment of a run, between the actions of events.
 

@@ -34,8 +34,9 @@ from srm_mbs.integration.kernel.events import contact_probe
 from srm_mbs.integration.kernel.system import Evaluator, SuccessiveWorkspaces
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
+from srm_mbs.model.numbers import positive_number
 from srm_mbs.model.validation import STATE_ARGUMENTS
-from srm_mbs.simulation.options import RunOptions, positive
+from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.runner import (
     Segment,
@@ -333,7 +334,7 @@ def _run_segments(
         )
     here = options._replace(t_eval=None)
     if options.sample_time is not None and options.controller is not None:
-        period = positive(options.sample_time, "sample_time", " of seconds")
+        period = positive_number(options.sample_time, "sample_time", " of seconds")
         here = here._replace(controller=_Sampled(options.controller, period))
     parts: list[R] = []
     segment: Segment[R] | None = None

@@ -28,7 +28,7 @@ from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend, code_is
 from srm_mbs.integration.messages import FailureCause
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.model.numbers import real_array
+from srm_mbs.model.numbers import positive_number, real_array
 from srm_mbs.model.validation import STATE_ARGUMENTS
 from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
 from srm_mbs.simulation.incremental_run import IncrementalRun, KernelRun, ReferenceRun
@@ -37,7 +37,6 @@ from srm_mbs.simulation.options import (
     RunOptions,
     check_embedded,
     finite,
-    positive,
 )
 from srm_mbs.simulation.result import Statistics
 from srm_mbs.simulation.runner import (
@@ -190,7 +189,7 @@ class Simulator:
             rates beyond use: ``t``, ``q`` and ``v`` are then those of the last good inner step.
         """
         started = time.perf_counter()
-        dt = positive(dt, "dt", " of seconds")
+        dt = positive_number(dt, "dt", " of seconds")
         force = self._no_force if tau is None else self._force(tau)
         run, t = self._run, self.t
         end = t + dt

@@ -96,6 +96,11 @@ def joined_names(names: Iterable[str]) -> str:
     return f"{listed} and {more} more" if more > 0 else listed
 
 
+def counted(count: int, noun: str) -> str:
+    """``1 degree``, ``2 degrees``: a ``noun`` with a regular plural."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 class _Printable(logging.Filter):
     """Escapes the texts of log records, as :func:`printable` does."""
 

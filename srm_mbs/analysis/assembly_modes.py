@@ -20,7 +20,7 @@ from srm_mbs.assembly.assemble import Assembly, assemble
 from srm_mbs.assembly.position import ClosureProblem, close_positions, onto_singular_point
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
-from srm_mbs.errors import InputError, get_logger, safe_repr
+from srm_mbs.errors import InputError, counted, get_logger, safe_repr
 from srm_mbs.model.coordinates import coordinate_names, free_coordinates, set_position
 from srm_mbs.model.numbers import name_list, named_values, positive_integer
 
@@ -208,8 +208,8 @@ def _check_isolated(
     labels = coordinate_names(mechanism)
     what = f"with {', '.join(held)} held" if held else "with no joint held"
     raise InputError(
-        f"{what} the mechanism can still move ({least.shape[1]} degrees of freedom): its closed "
-        "configurations are not isolated",
+        f"{what} the mechanism can still move ({counted(least.shape[1], 'degree')} of freedom): "
+        "its closed configurations are not isolated",
         element="hold",
         remedy=f"Hold more; free to move are {', '.join(labels[i] for i in moving)}",
     )

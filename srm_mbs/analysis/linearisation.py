@@ -27,7 +27,7 @@ from srm_mbs.dynamics.forces import friction_sums, resolved_forces
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.singularities.local_analysis import TAU
-from srm_mbs.errors import InputError, get_logger, safe_repr
+from srm_mbs.errors import InputError, counted, get_logger, safe_repr
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import finite_number, positive_integer, positive_number
@@ -188,10 +188,10 @@ def _chosen(mechanism: Mechanism, basis: FloatArray, names: Iterable[str] | None
     )
     if smallest < INDEPENDENCE_TOLERANCE:
         raise InputError(
-            f"{len(chosen)} coordinates of these joints do not determine the {k} degrees of "
-            "freedom here",
+            f"{counted(len(chosen), 'coordinate')} of these joints cannot determine the "
+            f"{counted(k, 'degree')} of freedom here",
             element="coordinates",
-            remedy=f"Name joints with {k} independent coordinates, or none",
+            remedy=f"Name joints with {counted(k, 'independent coordinate')}, or none",
         )
     return chosen
 

@@ -13,7 +13,7 @@ from typing import IO
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, known_names, naming
+from srm_mbs.errors import InputError, counted, known_names, naming
 from srm_mbs.formats.files import check_name, open_regular, shortened
 from srm_mbs.model.reach import Reach
 
@@ -211,7 +211,8 @@ class _Reader:
     def row(self, cells: list[str], at: int) -> list[float]:
         width = len(self.names)
         if len(cells) != width:
-            self.faults.setdefault(-1, (at, f"{len(cells)} values, {width} columns"))
+            reason = f"{counted(len(cells), 'value')}, {counted(width, 'column')}"
+            self.faults.setdefault(-1, (at, reason))
             return [np.nan] * width
         out = []
         for k, cell in enumerate(cells):

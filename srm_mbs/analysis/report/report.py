@@ -106,9 +106,9 @@ def report_page(
     solution: SimulationResult,
     certificate: Certificate,
     *,
-    animation: bool,
+    animation: bool = True,
     pictures: Sequence[str],
-    full_paths: bool,
+    full_paths: bool = False,
 ) -> str:
     """The page of :func:`write_report`."""
     player = None

@@ -389,6 +389,9 @@ class LoopClosure:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
+        given = self.type
+        if isinstance(given, ClosureType) and CLOSURE_TYPES.get(given.name) is given:
+            object.__setattr__(self, "type", given.name)
         places = name_places(self._element, self.a, self.b)
         name = checked_name(self.name, "loop")
         if not name:

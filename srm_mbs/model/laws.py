@@ -403,15 +403,31 @@ def curve_of(law: Law, initial: float = 0.0) -> Curve:
 
 
 def check_law(law: Law) -> None:
-    """Refuse a law of the user whose curve cannot be evaluated.
+    """Refuse a law of the user whose curve cannot be evaluated, or whose times are none.
 
     Raises
     ------
     InputError
-        As :func:`curve_of`.
+        Naming the law.
     """
-    if not is_of_package(law):
-        curve_of(law)
+    if is_of_package(law):
+        return
+    curve_of(law)
+    if finite_array(law.knots, (None,)) is None:
+        raise _fault(
+            law, f"its knots {safe_repr(law.knots)} are not times", "Give a list of numbers (s)"
+        )
+    try:
+        first, last = law.span
+        ascending = bool(first < last)
+    except Exception:  # objects may raise anything
+        ascending = False
+    if not ascending:
+        raise _fault(
+            law,
+            f"its span {safe_repr(law.span)} is not a first and a last time",
+            "Give two numbers (s), which may be infinite",
+        )
 
 
 def is_of_package(law: Law) -> bool:

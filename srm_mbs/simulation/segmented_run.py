@@ -313,7 +313,7 @@ def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
 
 
 def _function_of_state(event: Callable[..., Any], nq: int) -> MechanismFunction:
-    return MechanismFunction(event.function if isinstance(event, Event) else event, nq)
+    return MechanismFunction(event.function if type(event) is Event else event, nq)
 
 
 def _run_segments(

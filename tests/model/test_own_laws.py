@@ -114,6 +114,21 @@ def test_a_law_whose_curve_cannot_be_evaluated_is_refused(curve: Any, said: str)
             use()
 
 
+@pytest.mark.parametrize("knots", [None, 0.5, [np.nan], ["late"]])
+def test_a_law_whose_knots_are_no_times_is_refused(knots: Any) -> None:
+    with pytest.raises(srm.InputError, match=r"law 'given': its knots .* are not times"):
+        srm.Drive(Given(Curve(), knots), joint="crank")
+
+
+@pytest.mark.parametrize("span", [None, (1.0,), (np.nan, 1.0), (1.0, 0.0), ("a", 1.0)])
+def test_a_law_whose_span_is_none_is_refused(span: Any) -> None:
+    class Spanned(Given):
+        span = property(lambda law: span)  # type: ignore[assignment]
+
+    with pytest.raises(srm.InputError, match=r"its span .* is not a first and a last time"):
+        srm.Drive(Spanned(Curve()), joint="crank")
+
+
 def test_a_law_without_what_laws_have_is_answered_with_where_to_inherit_it() -> None:
     with pytest.raises(srm.InputError, match=r"inherits from srm_mbs\.model\.laws\.Law"):
         srm.Drive(lambda t: 2.0 * t, joint="crank")  # type: ignore[arg-type]

@@ -465,6 +465,22 @@ def test_a_bad_action_ends_the_run_with_everything_kept(
     assert solution.t[-1] == pytest.approx(np.sqrt(2.0 / G))
 
 
+class Above(srm.Event):
+    """The event 0.25 m above the zero of its function."""
+
+    def __call__(self, t: float, q: Any, v: Any) -> Any:
+        return super().__call__(t, q, v) - 0.25
+
+
+@on_both
+@pytest.mark.parametrize("action", [None, lambda t, q, v: None])
+def test_an_event_of_a_subclass_has_its_own_value_with_an_action_as_without(
+    ball: srm.Mechanism, action: Any, backend: str
+) -> None:
+    solution = srm.simulate(ball, 1.0, events=Above(height, action=action), backend=backend)
+    assert solution.t_events[0] == pytest.approx([np.sqrt(2.0 * 0.75 / G)])
+
+
 @pytest.mark.filterwarnings("ignore:Casting complex values")  # would be an error of its own
 @on_both
 @pytest.mark.parametrize("imaginary", [0.0, 2.0])

@@ -678,8 +678,9 @@ def _turns(
     columns = scheme.member(False).distinct
     stages = len(columns)
     first, last = np.maximum(dips[:, 0] - 1, 0) // stages, (dips[:, 2] - 1) // stages
-    alone = np.ones(len(dips), dtype=bool)
-    alone[1:] = dips[:-1, 1] < first[1:] * stages
+    # Nothing is read beyond an event that ends the run.
+    alone = steps.times[last + 1] <= steps.end
+    alone[1:] &= dips[:-1, 1] < first[1:] * stages
     alone[:-1] &= dips[1:, 1] > (last[:-1] + 1) * stages
     own = np.flatnonzero(alone)
     found, t, q = _reversals(monitor, steps, first[own], last[own])

@@ -134,6 +134,19 @@ def test_swings_pass_twice_where_they_turn_back_beyond_and_never_where_before(
     assert {crossing.kind for crossing in solution.crossings} <= {"passed"}
 
 
+@pytest.mark.parametrize("reach", [1e-3, 1e-4])
+def test_a_run_that_an_event_ends_between_two_passages_has_the_first(reach: float) -> None:
+    mechanism = turning.lifted(reach).mechanism
+    first, second, *_ = srm.simulate(mechanism, 1.0, rtol=1e-9).crossings
+
+    def halfway(t: float, q: Any, v: Any) -> float:
+        return t - 0.5 * (first.time + second.time)
+
+    cut = srm.simulate(mechanism, 1.0, rtol=1e-9, events=[srm.Event(halfway, terminal=True)])
+    assert cut.status == "event"
+    assert [crossing.time for crossing in cut.crossings] == pytest.approx([first.time], abs=1e-9)
+
+
 @TABLEAUS
 def test_a_motion_that_just_reaches_a_singular_configuration_says_so(tableau: str) -> None:
     """It comes to rest there, where nothing chooses a branch; it keeps the one it came along."""

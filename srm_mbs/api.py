@@ -377,8 +377,9 @@ def simulate(
     controller
         (t, q, v) -> generalised forces (nv,), N and N m, or a mapping {joint: force} with numbers
         for joints of one degree of freedom and arrays (joint.nv,) for others; joints that it does
-        not name have none.  Called at every stage; with ``sample_time`` at 0, T, 2 T, ... only,
-        and what it returned is held in between.
+        not name have none.  Called at every stage, of rejected steps too; with ``sample_time`` at
+        0, T, 2 T, ... only, and what it returned is held in between, as one needs that has memory
+        (an integral term, a filter) or adds noise.
     sample_time
         T (s) of a sampled controller.  Steps end on the samples.
     breakpoints : (k,)

@@ -129,6 +129,14 @@ class SrmError(Exception):
     def __str__(self) -> str:
         return printable(super().__str__(), keep="\n")
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies, also in other processes, have the attributes; nothing is constructed again."""
+        return _unconstructed, (type(self), self.args), self.__dict__
+
+
+def _unconstructed(kind: type[SrmError], arguments: tuple[Any, ...]) -> SrmError:
+    return kind.__new__(kind, *arguments)
+
 
 class InputError(SrmError, ValueError):
     """Bad input: what is wrong, where, and what to do about it.

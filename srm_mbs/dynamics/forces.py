@@ -51,7 +51,7 @@ from srm_mbs.model.forces import (
     UserForce,
     Wrench,
 )
-from srm_mbs.model.laws import Law
+from srm_mbs.model.laws import Law, curve_of
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import FRICTION_SPEED, MechanismData, per_model
 
@@ -195,7 +195,7 @@ class ValuesOverTime:
     ) -> None:
         self._numbers = np.array(numbers, dtype=float)
         laws = () if law is None else (law,) if isinstance(law, Law) else law
-        self._curves = [each.curve() for each in laws]
+        self._curves = list(map(curve_of, laws))
 
     def at(self, t: float) -> FloatArray:
         """The numbers at t (s)."""

@@ -37,10 +37,11 @@ from srm_mbs.formats.plausibility import (
     SMALLEST_GYRATION,
     doubtful_angles,
     doubtful_inertias,
+    doubtful_rotations,
 )
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
 from srm_mbs.formats.toml.parameters import Place
-from srm_mbs.formats.translation import NumbersOfVariants, TreeParts
+from srm_mbs.formats.translation import FileTerms, NumbersOfVariants, TreeParts
 from srm_mbs.formats.urdf.parser import UrdfModel, build_urdf, lock_joints
 from srm_mbs.formats.urdf.variants import OverridableTree
 from srm_mbs.formats.variants import Elements
@@ -201,17 +202,13 @@ class Reading:
         The texts of both.
     notes
         Sentences about approximations and ignored elements.
-    check
-        Of the assembled mechanism (:attr:`~srm_mbs.formats.translation.Translation.check`).
-    explain
-        As of :class:`~srm_mbs.formats.translation.Translation`.
     kind
         The class of the mechanism.
     variants
         Reads it again with other values of its parameters; None without parameters.
     analysis
         That of another variant of the description, if it is one.
-    parts, model, vary
+    file_terms, parts, model, vary
         As of :class:`~srm_mbs.formats.translation.Translation`.
     overridable
         The numbers of a URDF that its description changes, if variants may change them again.
@@ -224,8 +221,7 @@ class Reading:
     tree: Element
     source: Source
     notes: tuple[str, ...] = ()
-    check: Callable[[Mechanism], None] | None = None
-    explain: Callable[[AssemblyError], None] | None = None
+    file_terms: FileTerms | None = None
     kind: type[Mechanism] = Mechanism
     variants: VariantMaker | None = None
     analysis: ReusableAnalysis | None = None
@@ -479,13 +475,21 @@ def _are_plausible(bodies: Bodies | None) -> bool:
     )
 
 
-def _with_doubts(mechanism: Mechanism, description: Description) -> Mechanism:
+def _doubtful_angles(mechanism: Mechanism, reading: Reading) -> list[str]:
+    """Sentences about angles that may be in degrees."""
+    initial, terms = reading.description.initial, reading.file_terms
+    return [
+        *doubtful_angles(mechanism, "initial.q", initial.q, terms),
+        *doubtful_angles(mechanism, "initial.guess", initial.guess, terms),
+        *(() if reading.analysis is not None else doubtful_rotations(mechanism, reading.tree)),
+    ]
+
+
+def _with_doubts(mechanism: Mechanism, reading: Reading) -> Mechanism:
     """The mechanism with notes about values that look like those of other units, and about an axis
     that keeps a loop from moving; warnings say the same."""
-    initial = description.initial
     doubts = [
-        *doubtful_angles(mechanism, "initial.q", initial.q),
-        *doubtful_angles(mechanism, "initial.guess", initial.guess),
+        *_doubtful_angles(mechanism, reading),
         *(() if _are_plausible(bodies_at_start(mechanism)) else doubtful_inertias(mechanism)),
     ]
     if mechanism.loops and mechanism.degrees_of_freedom == 0 and not mechanism.drives:
@@ -525,9 +529,11 @@ def assembled(reading: Reading) -> Mechanism:
         if joint is None:
             _analysed(mechanism, reading)
     except AssemblyError as error:
-        if reading.explain is not None:
-            reading.explain(error)
-        error.remedy += _advice(error)
+        if reading.file_terms is not None:
+            reading.file_terms.explain(error)
+        error.remedy = ". ".join(
+            (error.remedy + _advice(error), *_doubtful_angles(mechanism, reading))
+        )
         if description.lock:
             locked = ", ".join(map(repr, description.lock))
             error.remedy = f"{error.remedy}. Locked, so that they cannot help: {locked}"
@@ -538,9 +544,9 @@ def assembled(reading: Reading) -> Mechanism:
         raise _in_gimbal_lock(
             source, f"the joint {mechanism.model.names[joint]!r} moves no inertia there"
         )
-    if reading.check is not None:
-        reading.check(mechanism)
-    mechanism = _with_doubts(mechanism, description)
+    if reading.file_terms is not None:
+        reading.file_terms.check(mechanism)
+    mechanism = _with_doubts(mechanism, reading)
     log.info(
         "%s: %d degrees of freedom, rank %d",
         mechanism.name,

@@ -19,7 +19,7 @@ from srm_mbs.formats.files import checked_path, write_texts
 from srm_mbs.formats.load import Overrides, read
 from srm_mbs.formats.toml.parameters import given_parameters
 from srm_mbs.model.numbers import flag, name_list
-from srm_mbs.model.reach import Reach
+from srm_mbs.model.reach import Reach, folder_list
 
 log = get_logger(__name__)
 
@@ -64,7 +64,7 @@ def convert(
     target = _description_path(out)
     overrides = Overrides(
         cut=name_list(cut, "cut"),
-        mesh_dirs=tuple(mesh_dirs),
+        mesh_dirs=folder_list(mesh_dirs),
         allow_outside=allow_outside,
         keyframe=keyframe,
         massless=massless,
@@ -120,7 +120,9 @@ def write_description(
             )
         if target.exists() and not force:
             raise InputError(
-                "the file exists", file=str(target), remedy="Give another name, or --force"
+                "the file exists",
+                file=str(target),
+                remedy="Give another name, or overwrite it with force=True (--force)",
             )
     entries = deepcopy(dict(reading.entries)) | {"urdf": urdf.name}
     _move_tables(entries, Path(source.path), description)

@@ -42,7 +42,7 @@ from srm_mbs.model.numbers import (
     name_list,
     positive_integer,
 )
-from srm_mbs.model.reach import Reach
+from srm_mbs.model.reach import Reach, folder_list
 
 log = get_logger(__name__)
 
@@ -183,8 +183,7 @@ def _translated(
         translation.tree,
         source,
         notes,
-        translation.check,
-        translation.explain,
+        translation.file_terms,
         parts=translation.parts,
         model=translation.model,
         elements=elements,
@@ -217,8 +216,7 @@ def _varied(
             found.values,
         ),
         notes=(*varied.notes, *found.notes),
-        check=None if known.numbers is None else known.numbers.check,
-        explain=None if known.numbers is None else known.numbers.explain,
+        file_terms=known.numbers,
         kind=variants.kind,
         variants=variants,
         analysis=variants.analysis,
@@ -529,7 +527,7 @@ def load(
         gravity,
         base,
         name_list(cut, "cut"),
-        tuple(mesh_dirs),
+        folder_list(mesh_dirs),
         allow_outside,
         keyframe,
         massless,

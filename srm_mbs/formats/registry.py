@@ -101,9 +101,9 @@ def find_format(path: Path, document: Document) -> Format:
         return found
     tag = document.root_tag
     suffix = shortened(path.suffix)
-    what = (
-        f"a file with the root element <{shortened(tag)}>" if tag else f"a file of type {suffix!r}"
-    )
+    what = f"a file of type {suffix!r}" if document.text.strip() else "an empty file"
+    if tag:
+        what = f"a file with the root element <{shortened(tag)}>"
     raise InputError(
         f"{what} is not of a format that is read",
         file=str(path),

@@ -126,18 +126,37 @@ def urdf_text(tree: Element) -> str:
     return tostring(tree, encoding="unicode") + "\n"
 
 
-class NumbersOfVariants(Protocol):
+class Written(NamedTuple):
+    """Where the start of a joint is written in a file, and the unit there with its factor to rad or
+    m."""
+
+    key: str
+    unit: str
+    factor: float
+
+
+class FileTerms(Protocol):
+    """Speaks of a mechanism in the terms of its file, where these differ from the entries of a
+    description."""
+
+    def check(self, mechanism: Mechanism) -> None:
+        """Raise InputError if the assembled mechanism cannot be what the file is meant to
+        describe."""
+
+    def explain(self, error: AssemblyError) -> None:
+        """Change the error about loops that do not close, or rates that contradict each other, to
+        one about what the file has."""
+
+    def written(self, joint: str) -> Written | None:
+        """How the start of a joint is written; None if it is an entry ``initial`` or not given."""
+
+
+class NumbersOfVariants(FileTerms, Protocol):
     """Finds the numbers of variants of a linkage."""
 
     def __call__(self, numbers: Sequence[float]) -> Numbers | None:
         """The numbers of a variant from those of the expressions of its description; None where it
         has to be read as a whole, because of a fault perhaps."""
-
-    def check(self, mechanism: Mechanism) -> None:
-        """As of a :class:`Translation`."""
-
-    def explain(self, error: AssemblyError) -> None:
-        """As of a :class:`Translation`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,11 +178,8 @@ class Translation:
         Sentences about approximations and ignored elements, with the reason.
     urdf_file
         The file that the URDF came from, if it is another one than that translated.
-    check
-        Raises InputError if the assembled mechanism cannot be what the file is meant to describe.
-    explain
-        Changes the error about loops that do not close, or rates that contradict each other, to one
-        about what the file has, where that differs from the entries.
+    file_terms
+        Speaks in the terms of the file; None where these are the entries.
     parts
         The bodies and joints of the tree, for :class:`KnownTree`; None where variants are built
         from their tree, or made from another.
@@ -179,8 +195,7 @@ class Translation:
     entries: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     urdf_file: str = ""
-    check: Callable[[Mechanism], None] | None = None
-    explain: Callable[[AssemblyError], None] | None = None
+    file_terms: FileTerms | None = None
     parts: TreeParts | None = None
     model: pin.Model | None = None
     vary: Callable[[Sequence[Place]], NumbersOfVariants | None] | None = None

@@ -83,6 +83,8 @@ VANISHING_TOGETHER = 2.0
 RECORDED_DEPTH = 0.75
 """Largest of the lowest sigmas between recorded samples, over those at the sides, of a minimum that
 is examined: sigma differs from the singular values by some per cent."""
+BESIDE_TURN = np.array([0.5, 0.8, 1.0, 1.25, 2.0])
+"""Times at which a crossing beside a turn is looked for, over the one expected."""
 DIP_WIDTHS = (1, 3)
 """Recorded intervals on either side of a minimum in which it is looked for, one after the other."""
 MAX_REFINEMENTS = 12
@@ -101,6 +103,8 @@ SIGNED_DECREASE = 0.5
 """Value over the smallest one so far from which on it has no sign that would change at a zero."""
 VELOCITY_VALUE = 0.05
 """Part of the values around at which the velocity is taken before and after a crossing."""
+REVERSAL_STEPS = 2
+"""Steps of Newton's iteration for the time at which a motion turns back."""
 REVERSAL_SIGMA = 0.02
 """sigma below which a motion that turns back may have met a bifurcation."""
 UNDECIDED_DISTANCE = 3e-6
@@ -617,71 +621,89 @@ def _dips_in(
 
 
 def _reversals(
-    monitor: ConstraintMonitor, scheme: ButcherTableau, steps: StepData, lowest: IndexArray
+    monitor: ConstraintMonitor, steps: StepData, first: IndexArray, last: IndexArray
 ) -> tuple[IndexArray, FloatArray, FloatArray]:
-    """Beside which of the recorded samples ``lowest`` (n,) all rates change their sign: their
-    indices (k,), and when (k,) s and where (k, nq) they do."""
-    own, unit = scheme.member(False), monitor.geometry.coordinate_unit
-    stages = len(own.distinct)
-    inner = np.flatnonzero((lowest > 1) & (lowest < stages * steps.count))
-    step, column = np.divmod(lowest[inner, None] + np.array([-2, -1, 0]), stages)
-    stage = own.distinct[column]
-    rates = steps.rates[step, stage, : len(unit)] / unit
-    change = rates[:, 2] - rates[:, 0]
+    """In which of the ranges of steps from ``first`` to ``last`` (n,) all rates change their sign,
+    once: their indices (k,), and when (k,) s and where (k, nq)."""
+    split, unit = monitor.analysis.split, monitor.geometry.coordinate_unit
+    rates = split(steps.states)[1] / unit
+    reverses = np.flatnonzero((rates[:-1] * rates[1:]).sum(axis=1) < 0.0)
+    place = np.searchsorted(reverses, first)
+    once = np.flatnonzero(np.searchsorted(reverses, last, side="right") == place + 1)
+    step = reverses[place[once]]
+    change = rates[step + 1] - rates[step]
     size = (change**2).sum(axis=1)
-    along = np.einsum("nij,nj->ni", rates, change)
-    across = size * (rates[:, ::2] ** 2).sum(axis=(1, 2)) - (along[:, ::2] ** 2).sum(axis=1)
-    turns = (along[:, 0] < 0.0) & (along[:, 2] > 0.0) & (across < (RESTING_SPEED * size) ** 2)
-    step, stage, along, change = step[turns], stage[turns], along[turns], change[turns]
-    t = steps.times[step] + own.abscissae[stage] * (steps.times[step + 1] - steps.times[step])
-    # Stages are less accurate than dense output, where one step of Newton's iteration follows.
-    (start, _, end), slope = t.T, (along[:, 2] - along[:, 0]) / (t[:, 2] - t[:, 0])
-    rest = np.clip(t[:, 1] - along[:, 1] / slope, start, end)
-    _, v = monitor.analysis.split(monitor.dense(rest))
-    rest = np.clip(rest - (v / unit * change).sum(axis=1) / slope, start, end)
-    return inner[turns], rest, monitor.configurations(rest)
+    before, after = ((rates[end] * change).sum(axis=1) for end in (step, step + 1))
+    both = (rates[step] ** 2 + rates[step + 1] ** 2).sum(axis=1)
+    straight = size * both - before**2 - after**2 < (RESTING_SPEED * size) ** 2
+    step, change, before, size = (values[straight] for values in (step, change, before, size))
+    start, end = steps.times[step], steps.times[step + 1]
+    t = start - before / size * (end - start)
+    for _ in range(REVERSAL_STEPS):
+        _, v = split(monitor.dense(t))
+        t = np.clip(t - (v / unit * change).sum(axis=1) / size * (end - start), start, end)
+    return once[straight], t, monitor.configurations(t)
 
 
-def _turned_back(
+@dataclass(frozen=True)
+class _Turn:
+    """Where a motion turned back next to a singular configuration, between two ends of steps.
+
+    Attributes
+    ----------
+    times
+        Of the one end, of the turn and of the other end (s).
+    values
+        The smallest singular value there, with the sign of the part of G that would lose rank:
+        positive at the turn.
+    """
+
+    times: tuple[float, float, float]
+    values: tuple[float, float, float]
+
+    @property
+    def beyond(self) -> bool:
+        """Whether the motion turned back beyond the singular configuration, not before it."""
+        return self.values[0] < 0.0
+
+
+def _turns(
     monitor: ConstraintMonitor, scheme: ButcherTableau, steps: StepData, recorded: RecordedDips
-) -> BoolArray:
-    """At which of the ``recorded`` minima (n,) the motion turned back before a singular
-    configuration without touching it: all rates change their sign, and the part of G that would
-    lose rank has the same one there as at the ends of the steps on both sides."""
-    dips, tops = np.array(recorded[1]), np.array(recorded[2])
-    out = np.zeros(len(dips), dtype=bool)
+) -> dict[int, _Turn]:
+    """The turns at those of the ``recorded`` minima, by their indices, where all rates change their
+    sign and the motion certainly did not touch the singular configuration."""
     if monitor.geometry.drives or np.logical_or.reduce(steps.stiff):
-        return out
+        return {}
+    dips, tops = np.array(recorded[1]), np.array(recorded[2])
     columns = scheme.member(False).distinct
     stages = len(columns)
-    lowest = dips[:, 1]
     first, last = np.maximum(dips[:, 0] - 1, 0) // stages, (dips[:, 2] - 1) // stages
     alone = np.ones(len(dips), dtype=bool)
-    alone[1:] = lowest[:-1] < first[1:] * stages
-    alone[:-1] &= lowest[1:] > (last[:-1] + 1) * stages
+    alone[1:] = dips[:-1, 1] < first[1:] * stages
+    alone[:-1] &= dips[1:, 1] > (last[:-1] + 1) * stages
     own = np.flatnonzero(alone)
-    found, t, q = _reversals(monitor, scheme, steps, lowest[own])
+    found, t, q = _reversals(monitor, steps, first[own], last[own])
     if not len(found):
-        return out
+        return {}
     found = own[found]
     first, last, top = first[found], last[found], np.maximum(tops[found] - 1, 0)
+    times = np.array((steps.times[first], t, steps.times[last + 1]))
     q_first, q_last = (monitor.analysis.split(steps.states[end])[0] for end in (first, last + 1))
-    G = monitor.separated(
-        np.concatenate((t, steps.times[first], steps.times[last + 1])),
-        np.concatenate((q, q_first, q_last)),
-    )
+    G = monitor.separated(times.ravel(), np.concatenate((q_first, q, q_last)))
     G = G.reshape(3, len(found), *G.shape[1:])
-    left, values, right = np.linalg.svd(G[0])
+    left, sizes, right = np.linalg.svd(G[1])
     k = monitor.rank - 1
-    value, before, after = np.einsum("ni,snij,nj->sn", left[:, :, k], G, right[:, k])
+    values = np.einsum("ni,snij,nj->sn", left[:, :, k], G, right[:, k])
+    before, value, after = np.abs(values)
     # The largest value of the window follows from the recorded sigmas.
     untouched = UNTOUCHED_VALUE * steps.sigmas[top // stages, columns[top % stages]]
-    single = values[:, :k].min(axis=1, initial=np.inf) > VANISHING_TOGETHER * value
-    same = np.minimum(before, after) > 0.0
+    certain = (sizes[:, :k].min(axis=1, initial=np.inf) > VANISHING_TOGETHER * value) & (
+        values[0] * values[2] > 0.0
+    )
     for side, recorded_side in ((before, steps.sigmas[first, 0]), (after, steps.sigmas[last, -1])):
-        same &= value * recorded_side > untouched * side
-    out[found] = single & same
-    return out
+        certain &= value * recorded_side > untouched * side
+    pairs = zip(found.tolist(), certain.tolist(), zip(*times.tolist()), zip(*values.tolist()))
+    return {i: _Turn(own_times, own) for i, yes, own_times, own in pairs if yes}
 
 
 def _times_around(
@@ -845,12 +867,13 @@ def find_crossings(
     searches = []
     if recorded is not None:
         t, dips, tops = recorded
-        turned = _turned_back(monitor, scheme, steps, recorded)
-        searches = [
-            _crossings_at(monitor, steps, t, dip, top)
-            for dip, top, back in zip(dips, tops, turned.tolist())
-            if not back
-        ]
+        turns = _turns(monitor, scheme, steps, recorded)
+        for i, (dip, top) in enumerate(zip(dips, tops)):
+            turn = turns.get(i)
+            if turn is None:
+                searches.append(_crossings_at(monitor, steps, t, dip, top))
+            elif turn.beyond:
+                searches.append(_crossings_beside(monitor, steps, turn, t[[top]]))
     found: dict[float, Crossing] = {}
     for crossings in (*monitor.together(searches), _crossings_along_curves(monitor, steps)):
         for crossing in crossings:
@@ -896,6 +919,30 @@ def _crossings_at(
     found = []
     for minimum in minima:
         crossing = yield from _crossing_at(monitor, steps, minimum, scale, times, values)
+        if crossing is not None:
+            found.append(crossing)
+    return found
+
+
+def _crossings_beside(
+    monitor: ConstraintMonitor, steps: StepData, turn: _Turn, top: FloatArray
+) -> Search[list[Crossing]]:
+    """The two crossings next to a ``turn`` beyond a singular configuration.
+
+    ``top`` (1,): when sigma of the window is largest (s).
+    """
+    (before, rest, after), (_, value, _) = turn.times, turn.values
+    scale = float((yield top)[0])
+    found = []
+    for side, size in ((before, turn.values[0]), (after, turn.values[2])):
+        # Next to the turn values are parabolic in time.
+        part = math.sqrt(value / (value - size)) * BESIDE_TURN
+        times = np.sort(np.append(rest + (side - rest) * np.append(0.0, part[part < 1.0]), side))
+        values = yield times
+        k = 1 + int(values[1:-1].argmin())
+        crossing = yield from _crossing_at(
+            monitor, steps, (0, k, len(times) - 1), scale, times, values
+        )
         if crossing is not None:
             found.append(crossing)
     return found

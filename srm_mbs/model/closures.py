@@ -33,7 +33,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
-from srm_mbs.model.copies import copied
+from srm_mbs.model.copies import copied, short_repr
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import (
     checked_name,
@@ -315,13 +315,15 @@ def _text(value: Any) -> str:
 
 
 def _listed(value: Any) -> tuple[Any, ...]:
+    if isinstance(value, str):
+        return (value,)
     try:
         return tuple(value)
     except Exception:  # objects may raise anything
         return ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LoopClosure:
     """One loop closure: between anchors ``a`` and ``b``, or (``coupling``) between joints.
 
@@ -384,7 +386,12 @@ class LoopClosure:
     arguments: tuple[float, ...] | None = _key("arguments", '"arguments = [...]"')
     without: tuple[str, ...] = ()
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
+        given = self.type
+        if isinstance(given, ClosureType) and CLOSURE_TYPES.get(given.name) is given:
+            object.__setattr__(self, "type", given.name)
         places = name_places(self._element, self.a, self.b)
         name = checked_name(self.name, "loop")
         if not name:
@@ -438,13 +445,13 @@ class LoopClosure:
     @property
     def _element(self) -> str:
         """Its name in messages."""
-        return f"loop {safe_repr(self.name)}"
+        return f"loop {safe_repr(self.name or self.type_name)}"
 
     def _fault(self, problem: str, remedy: str) -> InputError:
         return InputError(problem, element=self._element, remedy=remedy)
 
     def _take_without(self) -> None:
-        labels = (self.without,) if isinstance(self.without, str) else _listed(self.without)
+        labels = _listed(self.without)
         known = self._of_type().labels if labels else ()
         for label in labels:
             if label not in known:
@@ -468,7 +475,7 @@ class LoopClosure:
         object.__setattr__(self, "length", length)
 
     def _take_joints(self, given: Sequence[str]) -> None:
-        joints = (given,) if isinstance(given, str) else _listed(given)
+        joints = _listed(given)
         if not joints or not all(isinstance(name, str) for name in joints):
             raise self._fault(
                 f"joints = {safe_repr(given)} is not a list of names",

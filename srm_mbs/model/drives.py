@@ -19,7 +19,8 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.laws import Curve, Law, Polynomial, Sine, Table
+from srm_mbs.model.copies import short_repr
+from srm_mbs.model.laws import Curve, Law, Polynomial, Sine, Table, check_law, curve_of
 from srm_mbs.model.numbers import checked_name, unit_vector
 
 LAWS_WITH_VALUES = (Table, Polynomial, Sine)
@@ -29,7 +30,7 @@ NOMINAL_LENGTH = 1e-9
 """Length (m) of the closure of a driven distance, which the rows of the drive subtract again."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Drive:
     """A prescribed motion of a joint, or of a point relative to another.
 
@@ -69,14 +70,19 @@ class Drive:
     absolute: bool = False
     name: str = ""
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         places = name_places(self._element, self.a, self.b)
         name = checked_name(self.name, "drive") or self.joint or "_".join(["drive", *places])
         object.__setattr__(self, "name", name)
         if not isinstance(self.law, Law):
             raise self._fault(
-                f"{safe_repr(self.law)} is not a law", "Give srm.ConstantSpeed(...) or alike"
+                f"{safe_repr(self.law)} is not a law",
+                "Give srm.ConstantSpeed(...) or alike; a law of your own inherits from "
+                "srm_mbs.model.laws.Law",
             )
+        check_law(self.law)
         anchors = self.a is not None and self.b is not None
         if (self.joint is None) != anchors or (self.a is None) != (self.b is None):
             raise self._fault(
@@ -134,7 +140,7 @@ class Drive:
 
     def curve(self, initial: float) -> Curve:
         """s(t) for the coordinate that is ``initial`` at t = 0."""
-        curve = self.law.curve(initial)
+        curve = curve_of(self.law, initial)
         return curve if self.absolute else curve.shifted(initial - curve(0.0)[0])
 
     def check(self, model: pin.Model) -> None:

@@ -31,7 +31,7 @@ from srm_mbs.model.anchors import (
     resolve_moving,
     turn_counting_joint,
 )
-from srm_mbs.model.laws import Law
+from srm_mbs.model.laws import Law, check_law
 from srm_mbs.model.numbers import checked_name, finite_array, finite_numbers, plain
 
 
@@ -136,6 +136,8 @@ class ForceElement(ABC):
         if len(laws) not in (1, count) or not all(isinstance(each, Law) for each in laws):
             several = f" or a list of {count}" if count > 1 else ""
             raise self._fault(f"law is not a law{several}", "Give srm.Sine(...) or alike")
+        for each in laws:
+            check_law(each)
         self._set("law", laws[0] if len(laws) == 1 else laws)
         return laws
 

@@ -94,7 +94,11 @@ class Curve:
 
 @runtime_checkable
 class Law(Protocol):
-    """A law over time."""
+    """A law over time, twice continuously differentiable.
+
+    A class of one's own defines ``type`` and ``curve``, and ``knots`` and ``span`` where the
+    defaults do not fit; it inherits from this one, or has all four.
+    """
 
     type: ClassVar[str]
     """Its name in a description."""
@@ -384,6 +388,81 @@ class Table(Law):
     @property
     def span(self) -> tuple[float, float]:
         return self.t[0], self.t[-1]
+
+
+def curve_of(law: Law, initial: float = 0.0) -> Curve:
+    """s(t) of ``law``, checked if it is one of the user.
+
+    Raises
+    ------
+    InputError
+        If that is not a :class:`Curve` of numbers that fit to each other.
+    """
+    found = law.curve(initial)
+    return found if is_of_package(law) else _checked_curve(law, found)
+
+
+def check_law(law: Law) -> None:
+    """Refuse a law of the user whose curve cannot be evaluated, or whose times are none.
+
+    Raises
+    ------
+    InputError
+        Naming the law.
+    """
+    if is_of_package(law):
+        return
+    curve_of(law)
+    if finite_array(law.knots, (None,)) is None:
+        raise _fault(
+            law, f"its knots {safe_repr(law.knots)} are not times", "Give a list of numbers (s)"
+        )
+    try:
+        first, last = law.span
+        ascending = bool(first < last)
+    except Exception:  # objects may raise anything
+        ascending = False
+    if not ascending:
+        raise _fault(
+            law,
+            f"its span {safe_repr(law.span)} is not a first and a last time",
+            "Give two numbers (s), which may be infinite",
+        )
+
+
+def is_of_package(law: Law) -> bool:
+    """Whether the fields of ``law`` say all about it: a class of the user, also one that inherits
+    from a law of the package, may have another curve."""
+    return type(law) is LAW_TYPES.get(law.type)
+
+
+def _checked_curve(law: Law, found: Any) -> Curve:
+    if not isinstance(found, Curve):
+        raise _fault(law, f"its curve is {safe_repr(found)}", "Return a Curve")
+    breaks = finite_array(found.breaks, (None,))
+    if breaks is None or not len(breaks) or (np.diff(breaks) <= 0.0).any():
+        raise _fault(
+            law,
+            f"the breaks {safe_repr(found.breaks)} of its curve are not ascending times",
+            "Give at least one finite number (s)",
+        )
+    pieces = finite_array(found.pieces, (len(breaks), None))
+    if pieces is None or not pieces.shape[1]:
+        raise _fault(
+            law,
+            f"the pieces {safe_repr(found.pieces)} of its curve are not coefficients of "
+            f"{len(breaks)} polynomials",
+            "Give each break a list of finite numbers, all of one length",
+        )
+    sines = finite_array(found.sines, (None, 3)) if len(found.sines) else np.zeros((0, 3))
+    if sines is None:
+        raise _fault(
+            law,
+            f"the sines {safe_repr(found.sines)} of its curve are not triples of numbers",
+            "Give (amplitude, angular frequency in rad/s, phase in rad) of each",
+        )
+    rows: list[Any] = [tuple(map(tuple, array.tolist())) for array in (pieces, sines)]
+    return Curve(tuple(breaks.tolist()), *rows)
 
 
 LAW_TYPES: Mapping[str, type[Law]] = MappingProxyType(

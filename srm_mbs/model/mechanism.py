@@ -37,6 +37,8 @@ from srm_mbs.model.pinocchio_constraints import (
 )
 from srm_mbs.model.reach import Reach
 from srm_mbs.model.validation import (
+    START_ARGUMENTS,
+    STATE_ARGUMENTS,
     check_tree,
     checked_elements,
     checked_friction_speed,
@@ -396,13 +398,14 @@ class MechanismData(ResultOwner):
     def moved(self, q: Any, v: Any) -> Self:
         """The same mechanism at another state, q (nq,) and v (nv,), of its motion: unlike with
         :meth:`with_state`, drives continue their motion."""
-        changed = self.with_state(q, v)
+        changed = self.with_state(q, v, STATE_ARGUMENTS)
         return changed.with_drive_curves(self.drive_curves) if self.drives else changed
 
-    def with_state(self, q0: Any, v0: Any) -> Self:
-        """The same mechanism with another initial state, q0 (nq,) and v0 (nv,)."""
+    def with_state(self, q0: Any, v0: Any, names: tuple[str, str] = START_ARGUMENTS) -> Self:
+        """The same mechanism with another initial state, q0 (nq,) and v0 (nv,), which messages call
+        ``names``."""
         changed = self._at_no_start()
-        changed._take_start(q0, v0)
+        changed._take_start(q0, v0, names)
         return changed
 
     def with_drive_curves(self, curves: dict[str, Curve]) -> Self:
@@ -437,8 +440,8 @@ class MechanismData(ResultOwner):
         """The initial state, q0 and v0 (nq + nv,), read-only."""
         return _start_state(self)
 
-    def _take_start(self, q0: Any, v0: Any) -> None:
-        q0, v0 = checked_start(self.model, q0, v0)
+    def _take_start(self, q0: Any, v0: Any, names: tuple[str, str] = START_ARGUMENTS) -> None:
+        q0, v0 = checked_start(self.model, q0, v0, names)
         object.__setattr__(self, "q0", q0)
         object.__setattr__(self, "v0", v0)
 

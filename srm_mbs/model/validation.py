@@ -240,6 +240,15 @@ def checked_elements(
         parts: tuple[Any, ...] = tuple(given) if several else (given,)
     except Exception:  # objects may raise anything
         several, parts = False, (given,)
+    for i, part in enumerate(parts):
+        base = next((known.__name__ for known in types if isinstance(part, known)), "")
+        if base and type(part) not in types:
+            raise InputError(
+                f"the class {safe_repr(type(part).__name__)} inherits from {base}, of which the "
+                "equations read the fields alone",
+                element=f"{what}s[{i}]",
+                remedy=f"Give an object of {base} itself, which a function may make",
+            )
     if not several or not all(type(part) in types for part in parts):
         raise InputError(
             f"{what}s = {safe_repr(given)} is not a list of {what}s",
@@ -274,12 +283,12 @@ def without(what: str, parts: Sequence[Part], name: str) -> tuple[Part, ...]:
     return kept
 
 
-STATE_ARGUMENTS = "q", "v"
-"""Names of a state where a function takes it, for :func:`checked_start`."""
+START_ARGUMENTS, STATE_ARGUMENTS = ("q0", "v0"), ("q", "v")
+"""Names of an initial state, and of a state where a function takes it."""
 
 
 def checked_start(
-    model: pin.Model, q0: Any, v0: Any, names: tuple[str, str] = ("q0", "v0")
+    model: pin.Model, q0: Any, v0: Any, names: tuple[str, str] = START_ARGUMENTS
 ) -> tuple[FloatArray, FloatArray]:
     """Read-only copies of an initial state, q0 (nq,) and v0 (nv,), which messages call ``names``.
 

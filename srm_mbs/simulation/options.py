@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, known_names, safe_repr, warn
+from srm_mbs.errors import InputError, joined_names, known_names, safe_repr, warn
 from srm_mbs.integration.control.prescribed_times import PLACEMENTS
 from srm_mbs.integration.methods.base import NEGLIGIBLE, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.methods.psrm import PSRM
+from srm_mbs.integration.methods.psrm import PSRM, is_split
 from srm_mbs.integration.methods.tableaus import get_tableau
 from srm_mbs.integration.methods.thesis.srm import SRM
 from srm_mbs.model.numbers import choice, finite_array, finite_number, flag, positive_number
@@ -51,6 +51,10 @@ METHODS: dict[str, Callable[..., Method]] = {
 }
 """Methods that can be given by name; sweeps that restart, because own histories and step-size
 control do not go together (:class:`srm_mbs.SRM`)."""
+
+
+METHOD_ATTRIBUTES = ("scheme", "start", "step", "accept", "resume")
+"""Those of :class:`~srm_mbs.integration.methods.base.Method`."""
 
 
 class RunOptions(NamedTuple):
@@ -227,7 +231,7 @@ def numbers(values: Any, what: str, remedy: str) -> FloatArray:
 
 def loosest_rtol(method: Method) -> float:
     """The loosest rtol with which ``method`` keeps to its branch of the motion."""
-    if not (isinstance(method, PSRM) and method.correction == "split"):
+    if not is_split(method):
         return LOOSEST_RTOL
     order = method.scheme.controller_order or 1
     return next(rtol for least, rtol in LOOSEST_OF_SPLIT.items() if order >= least)
@@ -283,13 +287,20 @@ def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -
             element="tableau",
             remedy="Give the tableau to the method: PSRM(tableau=...)",
         )
-    if isinstance(method, type) or not all(
-        hasattr(method, name) for name in ("scheme", "start", "step", "accept")
-    ):
+    missing = [name for name in METHOD_ATTRIBUTES if not hasattr(method, name)]
+    if isinstance(method, type) or missing:
+        partly = 0 < len(missing) < len(METHOD_ATTRIBUTES)
+        without = f": it has no {joined_names(missing)}" if partly else ""
         raise InputError(
-            f"method = {safe_repr(method)} is not a method",
+            f"method = {safe_repr(method)} is not a method{without}",
             element="method",
             remedy='Give "psrm" or an object such as PSRM(tableau="dopr54")',
+        )
+    if not isinstance(method.scheme, ButcherTableau):
+        raise InputError(
+            f"the scheme of the method is {safe_repr(method.scheme)}",
+            element="method",
+            remedy="Give it an srm.ButcherTableau, such as one of srm.TABLEAUS",
         )
     return method
 

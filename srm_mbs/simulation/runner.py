@@ -71,7 +71,7 @@ from srm_mbs.integration.messages import (
 )
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method, method_messages
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.methods.psrm import PSRM
+from srm_mbs.integration.methods.psrm import is_split
 from srm_mbs.integration.methods.thesis.sweep_branch_guard import branch_guard
 from srm_mbs.integration.singular_endpoints import start
 from srm_mbs.integration.singular_passages import (
@@ -83,6 +83,7 @@ from srm_mbs.model.forces import LimitSpring
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import per_model, per_start, per_tree
 from srm_mbs.model.numbers import finite_array
+from srm_mbs.model.validation import START_ARGUMENTS
 from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause, rounding_clause
 from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
 from srm_mbs.simulation.options import (
@@ -466,7 +467,7 @@ def check_consistent(
     t: float = 0.0,
     backend: str = "python",
     system: OpenSystem | ClosedSystem | None = None,
-    names: tuple[str, str] = ("q0", "v0"),
+    names: tuple[str, str] = START_ARGUMENTS,
 ) -> None:
     """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates, which
     ``backend`` evaluates; ``system`` is that of the mechanism, if it is at hand.  Messages call
@@ -588,7 +589,7 @@ def assemble_problem(
         if known is not None:
             problem.last_step = _repeated_step(before.end)
     # Sweeps say at the end what they met in their steps.
-    if options.t_eval is not None and isinstance(method, PSRM) and method.correction == "split":
+    if options.t_eval is not None and is_split(method):
         problem.stream = OutputStream(system, method.scheme, options.t_eval, by)
     return problem
 
@@ -702,7 +703,7 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
         handler.sample = sampler(system, problem.held, watch, controller, interval, kernel_system)
         handler.sample(t0, state)
     if evaluator is None:
-        memory = start(system, method, t0, state, norm, options.t_end)
+        memory = start(system, method, t0, state, norm, handler.end)
         memory.stiff = problem.stiff
         found = integrate_steps(
             system,
@@ -720,7 +721,7 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
         return found
     check_embedded(method.scheme, options.step)
     given = options.first_step or problem.last_step or None
-    first = first_stage(evaluator, method, t0, state, norm, options.t_end, problem.stiff)
+    first = first_stage(evaluator, method, t0, state, norm, handler.end, problem.stiff)
     try:
         run = _compiled_run(problem, kernel_system, first, given, handler)
     except ArithmeticError:  # the reference raises the error that says why
@@ -912,6 +913,8 @@ class FinishedRun:
         self.backend, self._passages = problem.backend, problem.passages
         self._kernel_system = None if shared(problem.system) else kernel_system
         self._record, self._counters = record, counters
+        if self._passages is not None and self._passages.examined:
+            self._passages.ended(record.end_of_steps().time)
         # Before anything reads the dense output, which evaluates stages.
         self._work = self._system.evaluations, self._system.factorisations
         self.controlled = options.controller is not None or self._system.has_user_forces

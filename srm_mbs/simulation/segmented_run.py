@@ -35,6 +35,7 @@ from srm_mbs.integration.kernel.system import Evaluator, SuccessiveWorkspaces
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
 from srm_mbs.model.numbers import positive_number
+from srm_mbs.model.validation import STATE_ARGUMENTS
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.runner import (
@@ -91,6 +92,11 @@ class Event:
         self.__name__ = getattr(function, "__name__", "<lambda>")
         self.function, self.action = function, action
         self.direction, self.terminal = direction, terminal
+
+    def __repr__(self) -> str:
+        action = getattr(self.action, "__name__", self.action)
+        fixed = f"direction={self.direction!r}, terminal={self.terminal!r}"
+        return f"Event({self.__name__}, {fixed}, action={action})"
 
     def __call__(self, t: float, q: FloatArray, v: FloatArray) -> Any:
         """The value of the function."""
@@ -307,7 +313,7 @@ def run(mechanism: Mechanism, options: RunOptions, types: ResultTypes[R]) -> R:
 
 
 def _function_of_state(event: Callable[..., Any], nq: int) -> MechanismFunction:
-    return MechanismFunction(event.function if isinstance(event, Event) else event, nq)
+    return MechanismFunction(event.function if type(event) is Event else event, nq)
 
 
 def _run_segments(
@@ -577,15 +583,27 @@ def _acted(
     try:
         if isinstance(answer, Switch):
             return _switched(mechanism, answer, t, q, v)
-        q, v = (np.asarray(part, dtype=float) for part in answer)
+        q, v = _state(answer)
         moved = mechanism.continued(q, v)
         if moved.constrained:
-            check_consistent(moved, t, backend)
+            check_consistent(moved, t, backend, names=STATE_ARGUMENTS)
         return moved, moved.q0, moved.v0
     except (InputError, EvaluationError, TypeError, ValueError) as error:
         raise EventError(
             f"the action of the event {event.name!r} cannot be carried out: {error}"
         ) from error
+
+
+def _state(answer: Any) -> tuple[Any, Any]:
+    """q and v from the ``answer`` of an action, as they are."""
+    try:
+        q, v = answer
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"it returned {safe_repr(answer)}",
+            remedy="Return None, the state (q, v), or srm.Switch(mechanism)",
+        ) from error
+    return q, v
 
 
 def _curves_from(t: float, old: Mechanism, new: Mechanism) -> dict[str, Curve]:
@@ -615,12 +633,13 @@ def _switched(
             "a switch leads to something else than a mechanism with the same joints",
             remedy="Give a mechanism made from this one, for example with dataclasses.replace",
         )
-    new = new.with_state(q if switch.q is None else switch.q, v if switch.v is None else switch.v)
+    q, v = (q if switch.q is None else switch.q), (v if switch.v is None else switch.v)
+    new = new.with_state(q, v, STATE_ARGUMENTS)
     new = new.with_drive_curves(_curves_from(t, mechanism, new))
     given = new.start_state
     system = make_system(new)
     x = onto_closures(system, t, given)
     if system.position_norm(system.difference(given, x)) > LARGEST_PROJECTION:
-        check_consistent(new, t)
+        check_consistent(new, t, names=STATE_ARGUMENTS)
     nq = new.model.nq
     return new, x[:nq], x[nq:]

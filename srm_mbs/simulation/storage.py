@@ -48,7 +48,7 @@ from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.drives import Drive
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement, UserForce
-from srm_mbs.model.laws import Curve, Law, Samples
+from srm_mbs.model.laws import Curve, Law, Samples, is_of_package
 from srm_mbs.model.mechanism import SimulationDefaults, Source, SourceTexts
 from srm_mbs.model.model_data import model_from_data, model_to_data
 from srm_mbs.model.pinocchio_archive import model_from_archive
@@ -234,11 +234,22 @@ def _notes(mechanism: Mechanism, full_paths: bool) -> list[str]:
     return notes
 
 
+def _with_own_laws(mechanism: Mechanism) -> Iterator[Drive | ForceElement]:
+    """The drives and forces whose laws are those of the user."""
+    parts: tuple[Drive | ForceElement, ...] = (*mechanism.drives, *mechanism.forces)
+    for part in parts:
+        law = getattr(part, "law", None)
+        laws = law if isinstance(law, tuple) else () if law is None else (law,)
+        if not all(map(is_of_package, laws)):
+            yield part
+
+
 def _run_arrays(solution: SimulationResult, path: Path, full_paths: bool) -> dict[str, Any]:
     """The arrays of a run of one segment, its JSON text among them; messages call it ``path``."""
     mechanism = solution.mechanism
     own = [loop.type_name for loop in mechanism.loops if not isinstance(loop.type, str)]
     refused = [f"closure type {name!r}" for name in own]
+    refused += [f"law of {part.name!r}" for part in _with_own_laws(mechanism)]
     if TABLEAUS.get(solution.scheme.name) is not solution.scheme:
         refused.insert(0, f"tableau {solution.scheme.name!r}")
     if refused:

@@ -767,13 +767,39 @@ class OwnForce(srm.ForceElement):
         ("drives", [srm.TorsionSpring("crank", 1.0)]),
         ("forces", [srm.Drive(srm.ConstantSpeed(1.0), "crank")]),
         ("forces", [OwnForce()]),
-        ("forces", [OwnSpring("crank", 1.0)]),
     ],
 )
 def test_elements_that_are_no_list_of_them_are_refused(what: str, given: Any) -> None:
     mechanism = srm.load("four_bar")
     with pytest.raises(srm.InputError, match=f"{what} = .* is not a list of {what}"):
         replace(mechanism, **{what: given})
+
+
+class OwnClosure(srm.LoopClosure):
+    """Would have other rows, if anything read them."""
+
+
+class OwnDrive(srm.Drive):
+    """Would have another motion."""
+
+
+@pytest.mark.parametrize(
+    ("what", "given"),
+    [
+        ("loops", OwnClosure("point", srm.Anchor("coupler"), srm.Anchor("world"))),
+        ("drives", OwnDrive(srm.ConstantSpeed(1.0), "crank")),
+        ("forces", OwnSpring("crank", 1.0)),
+    ],
+)
+def test_an_element_of_a_subclass_is_refused_by_the_name_of_its_class(
+    what: str, given: Any
+) -> None:
+    kind, base = type(given).__name__, type(given).__mro__[1].__name__
+    said = (
+        rf"{what}\[0\]: the class '{kind}' inherits from {base}, .* Give an object of {base} itself"
+    )
+    with pytest.raises(srm.InputError, match=said):
+        replace(srm.load("four_bar"), **{what: [given]})
 
 
 def test_a_force_element_of_ones_own_is_answered_with_the_user_force() -> None:

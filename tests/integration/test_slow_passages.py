@@ -82,7 +82,7 @@ def swung(reach: float, tableau: str, tol: float = 1e-8) -> tuple[srm.Solution, 
 
 
 @TABLEAUS
-@pytest.mark.parametrize("reach", [0.3, 0.03, 0.01, 1e-3])
+@pytest.mark.parametrize("reach", [0.3, 0.03, 0.01, 1e-3, 1e-4])
 def test_a_motion_that_turns_back_beyond_passes_twice(tableau: str, reach: float) -> None:
     solution, error = swung(reach, tableau)
     assert error.max() < 1e-7
@@ -107,7 +107,7 @@ def test_a_motion_that_turns_back_before_passes_nowhere(tableau: str, reach: flo
 
 
 @on_both
-@pytest.mark.parametrize("reach", [1e-2, 1e-3, -1e-5, -1e-4, -1e-3, -1e-2])
+@pytest.mark.parametrize("reach", [1e-2, 1e-3, 1e-4, 1e-5, -1e-5, -1e-4, -1e-3, -1e-2])
 def test_swings_pass_twice_where_they_turn_back_beyond_and_never_where_before(
     reach: float, backend: str
 ) -> None:

@@ -174,3 +174,11 @@ def test_columns_of_a_csv_file_are_found_by_name(tmp_path: Path) -> None:
     path = tmp_path / "motion.csv"
     path.write_text("angle, t ,other\n1.5,0.0,7\n\n2.5,0.1,8\n")
     np.testing.assert_array_equal(read_csv(path).columns(("t", "angle")), [[0.0, 1.5], [0.1, 2.5]])
+
+
+def test_a_table_with_semicolons_is_told_to_have_commas(tmp_path: Path) -> None:
+    """Spreadsheets write them, and decimal commas, where numbers have these."""
+    path = tmp_path / "motion.csv"
+    path.write_text("t;angle\n0,0;1,5\n0,1;2,5\n")
+    with pytest.raises(srm.InputError, match=r"no column 't'. Separate columns by commas"):
+        read_csv(path).columns(("t", "angle"))

@@ -42,6 +42,14 @@ def test_a_closure_type_of_ones_own_is_named_like_any_other() -> None:
     assert mechanism.degrees_of_freedom == 1
 
 
+def test_a_type_of_the_package_is_the_same_by_its_name_and_as_an_object() -> None:
+    for name, kind in srm.CLOSURE_TYPES.items():
+        if kind.needs == ("a", "b"):
+            by_name = srm.LoopClosure(name, MASS, WORLD)
+            assert srm.LoopClosure(kind, MASS, WORLD) == by_name
+    assert srm.LoopClosure(srm.CLOSURE_TYPES["distance"], MASS, WORLD).type == "distance"
+
+
 def test_a_key_that_a_closure_type_of_ones_own_needs_is_asked_for() -> None:
     with pytest.raises(srm.InputError, match="a point_on_circle closure needs a length"):
         srm.LoopClosure(CIRCLE, MASS, WORLD, axis=(0.0, 1.0, 0.0))

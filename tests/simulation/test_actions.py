@@ -447,8 +447,9 @@ def test_runs_start_at_any_time(ball: srm.Mechanism, backend: str) -> None:
     ("action", "message"),
     [
         (lambda t, q, v: 1 / 0, "raised ZeroDivisionError"),
-        (lambda t, q, v: 3, "cannot be carried out"),
-        (lambda t, q, v: (q,), "cannot be carried out"),
+        (lambda t, q, v: 3, "it returned 3. Return None, the state (q, v), or srm.Switch"),
+        (lambda t, q, v: (q,), "Return None, the state (q, v), or srm.Switch(mechanism)"),
+        (lambda t, q, v: flywheels(), "it returned Mechanism('"),
         (lambda t, q, v: (q, [1.0, 2.0]), "finite numbers"),
         (lambda t, q, v: srm.Switch(None), "same joints"),  # type: ignore[arg-type]
         (lambda t, q, v: srm.Switch(flywheels()), "same joints"),
@@ -464,6 +465,45 @@ def test_a_bad_action_ends_the_run_with_everything_kept(
     assert solution.t[-1] == pytest.approx(np.sqrt(2.0 / G))
 
 
+class Above(srm.Event):
+    """The event 0.25 m above the zero of its function."""
+
+    def __call__(self, t: float, q: Any, v: Any) -> Any:
+        return super().__call__(t, q, v) - 0.25
+
+
+@on_both
+@pytest.mark.parametrize("action", [None, lambda t, q, v: None])
+def test_an_event_of_a_subclass_has_its_own_value_with_an_action_as_without(
+    ball: srm.Mechanism, action: Any, backend: str
+) -> None:
+    solution = srm.simulate(ball, 1.0, events=Above(height, action=action), backend=backend)
+    assert solution.t_events[0] == pytest.approx([np.sqrt(2.0 * 0.75 / G)])
+
+
+@pytest.mark.filterwarnings("ignore:Casting complex values")  # would be an error of its own
+@on_both
+@pytest.mark.parametrize("imaginary", [0.0, 2.0])
+@pytest.mark.parametrize("place", [0, 1], ids=["q", "v"])
+def test_a_complex_state_from_an_action_is_refused_as_other_wrong_ones_are(
+    ball: srm.Mechanism, place: int, imaginary: float, backend: str
+) -> None:
+    factors = [1.0, 1.0]
+    factors[place] = 1.0 + 1j * imaginary
+    of_q, of_v = factors
+    for action in (
+        lambda t, q, v: (of_q * q, of_v * v),
+        lambda t, q, v: ([of_q * q[0]], [of_v * v[0]]),
+        lambda t, q, v: srm.Switch(ball, q=of_q * q, v=of_v * v),
+    ):
+        event = srm.Event(height, direction=-1, action=action)
+        solution = srm.simulate(ball, 2.0, events=event, backend=backend)
+        assert solution.status == "failed"
+        name = "qv"[place]
+        said = f"cannot be carried out: {name}: {name} does not consist of 1 finite numbers"
+        assert f"the action of the event 'height' {said}" in solution.message
+
+
 def test_a_switch_to_closures_that_are_open_is_refused() -> None:
     wheels = flywheels()
     clutch = srm.LoopClosure("coupling", joints=("a", "b"), ratio=1.0, name="clutch")
@@ -473,11 +513,23 @@ def test_a_switch_to_closures_that_are_open_is_refused() -> None:
     assert "violates the closures" in solution.message
 
 
+def test_an_event_is_shown_with_its_attributes() -> None:
+    event = srm.Event(height, direction=-1, action=height)
+    assert repr(event) == "Event(height, direction=-1, terminal=False, action=height)"
+    assert repr(srm.Event(height)) == "Event(height, direction=0.0, terminal=False, action=None)"
+
+
 def test_bad_events_and_loops_are_refused(ball: srm.Mechanism) -> None:
     pinned = load("slider_crank")
+
+    def falling(t: float, q: Any, v: Any) -> float:
+        return float(q[0])
+
+    falling.action = "stop"  # type: ignore[attr-defined]
     calls = {
         "event of a number": lambda: srm.Event(3),  # type: ignore[arg-type]
         "action of a number": lambda: srm.Event(height, action=3),  # type: ignore[arg-type]
+        "action of a text": lambda: srm.simulate(ball, 1.0, events=falling),
         "terminal = -1": lambda: srm.simulate(ball, 1.0, events=floor(0.5, terminal=-1)),
         "with a loop twice": lambda: pinned.with_loop(pinned.loops[0]),
         "restitution above 1": lambda: srm.impact(ball, ball.q0, ball.v0, [1.0], 2.0),

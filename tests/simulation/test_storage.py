@@ -346,6 +346,17 @@ def test_copies_of_a_run_say_the_same_wherever_they_are_read(
             assert np.array_equal(other.reactions[loop], forces)
 
 
+@pytest.mark.parametrize("copied", [lambda run: pickle.loads(pickle.dumps(run)), copy.deepcopy])
+@pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
+def test_a_run_that_another_process_made_is_saved_like_any_other(
+    tableau: str, copied: Any, tmp_path: Path
+) -> None:
+    run = srm.simulate(srm.load("four_bar"), 0.5, tableau=tableau)
+    again = reloaded(copied(run), tmp_path)
+    t = np.linspace(0.0, 0.5, 11)
+    assert np.array_equal(again(t), run(t))
+
+
 def late(t: float, q: Any, v: Any) -> float:
     return t - 0.3
 

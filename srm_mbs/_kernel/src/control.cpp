@@ -77,7 +77,7 @@ StepDecision PIControl::decide(const Proposal& proposal, const StepResult* resul
 Proposal FixedStep::propose(double t, double limit, IntegratorState&) {
     double target = t0_ + static_cast<double>(index_) * step_;
     if (target > t_end_ - 1e-9 * step_) target = t_end_;
-    if (limit < target - t) return over(t, limit, constants_);
+    if (limit < target - t - sliver()) return over(t, limit, constants_);
     return {target - t, target};
 }
 

@@ -19,7 +19,7 @@ from srm_mbs.analysis.accuracy.samples import Samples, sample_states, sample_tim
 from srm_mbs.dynamics.observables import NO_ANGLES
 from srm_mbs.dynamics.scaling import angle_coordinates, start_rounding
 from srm_mbs.errors import InputError
-from srm_mbs.integration.methods.psrm import PSRM
+from srm_mbs.integration.methods.psrm import is_split
 from srm_mbs.model.mechanism import MechanismData, per_model
 from srm_mbs.model.numbers import positive_number
 from srm_mbs.simulation.options import tightest_rtol
@@ -354,7 +354,7 @@ def _expected(solution: SimulationResult, fixed: bool) -> float | None:
         return 1.0
     request = solution.request
     method = "" if request is None else request.method
-    split = method == "psrm" or (isinstance(method, PSRM) and method.correction == "split")
+    split = method == "psrm" if isinstance(method, str) else is_split(method)
     return float(solution.scheme.order) if split else None
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,7 +19,7 @@ from srm_mbs.formats.toml.description import check_description, parse_toml
 from srm_mbs.formats.toml.parameters import PARAMETERS
 from srm_mbs.formats.translation import PLANAR
 from srm_mbs.formats.xml import parse_xml
-from srm_mbs.model.laws import ConstantSpeed, Law, Samples
+from srm_mbs.model.laws import ConstantSpeed, Law, Samples, is_of_package
 from srm_mbs.model.mechanism import Source
 from srm_mbs.model.numbers import checked_name, name_list, named_values, plain
 
@@ -265,8 +265,14 @@ def _law(given: Any) -> dict[str, Any]:
     """The table of a law, of which a number is the constant speed."""
     if isinstance(given, Mapping):
         return dict(given)
-    if isinstance(given, Law) and is_dataclass(given):
-        values = {key.name: getattr(given, key.name) for key in fields(given)}
+    if isinstance(given, Law):
+        if not is_of_package(given):
+            raise InputError(
+                f"{safe_repr(given)} is not a law that a description can have",
+                element="drives",
+                remedy="Give its srm.Drive to the linkage, with dataclasses.replace",
+            )
+        values = {key.name: getattr(given, key.name) for key in fields(given)}  # type: ignore[arg-type]
         return {"type": given.type, **{k: v for k, v in values.items() if v is not None}}
     return {"type": ConstantSpeed.type, "speed": given}
 

@@ -60,6 +60,7 @@ from srm_mbs.formats.translation import (
     Options,
     Translation,
     Vector,
+    Written,
     merged_initial,
     urdf_text,
 )
@@ -353,8 +354,7 @@ class _Linkage:
             lambda: urdf_text(self._urdf(drawn=True)),
             entries,
             tuple(self.notes()),
-            check=self.check,
-            explain=self.explain,
+            file_terms=self,
             parts=plain_parts(bodies, joints) if model is None else None,
             model=model,
             vary=self.variants if model is None else None,
@@ -571,6 +571,14 @@ class _Linkage:
         ]
         if in_units:
             error.remedy += f" ({', '.join(in_units)})"
+
+    def written(self, joint: str) -> Written | None:
+        """How the start of a joint is written in the section; None if it is not given there, or
+        the description has one that counts instead."""
+        own = self.options.own.get("initial", {})
+        if joint not in self.entry.start or joint in {*own.get("q", ()), *own.get("guess", ())}:
+            return None
+        return Written(f"{PLANAR}.start", self._unit(joint), self._factor(joint))
 
     # -- variants ------------------------------------------------------------------------------
 
@@ -801,6 +809,10 @@ class LinkageVariants:
     def explain(self, error: AssemblyError) -> None:
         """Name what the section has."""
         self._linkage.explain(error)
+
+    def written(self, joint: str) -> Written | None:
+        """How the section has it."""
+        return self._linkage.written(joint)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Without the checked section, whose tables may have classes made at run time."""

@@ -337,7 +337,8 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
         raise InputError(
             f"this is not valid TOML: {_without_quotes(error)}",
             file=file,
-            remedy="Correct it there; text stands in quotes, lists in [ ]",
+            remedy="Correct it there; text stands in quotes, as keys with blanks or accents do, "
+            "lists in [ ]",
         ) from error
     with naming(file=file):
         _check_texts(entries)

@@ -16,7 +16,7 @@ from srm_mbs.integration.generated.code import source_of_structure, structure_of
 from srm_mbs.integration.generated.code_cache import compiler
 from srm_mbs.integration.generated.policy import code_at_hand, compile_seconds
 from srm_mbs.integration.methods.base import Method
-from srm_mbs.integration.methods.psrm import PSRM
+from srm_mbs.integration.methods.psrm import is_split
 from srm_mbs.model.numbers import choice
 
 log = get_logger(__name__)
@@ -117,7 +117,7 @@ def check_kernel() -> None:
 
 def unsupported_reason(method: Method, placement: str, singular_times: FloatArray) -> str | None:
     """Which option of a run the kernel lacks; None if it has them all."""
-    if not (isinstance(method, PSRM) and method.correction == "split"):
+    if not is_split(method):
         return "it has the split PSRM only"
     if placement not in PLACEMENTS:
         return f"it has no placement {safe_repr(placement)}"

@@ -230,6 +230,8 @@ class ButcherTableau(_Record):
             _freeze(self, owner, error=(s + 1,))
             _check_sums(self.error[None, :], np.zeros(1), f"{owner}: sum of error")
         object.__setattr__(self, "extensions", MappingProxyType(dict(self.extensions)))
+        if not isinstance(self.dense, DenseExtension):
+            raise ValueError(f"{owner}: dense is {self.dense!r}, not a DenseExtension")
         if self.extensions.get(self.dense.name) is not self.dense:
             raise ValueError(f"{owner}: dense ({self.dense.name!r}) is not one of its extensions")
         for name, extension in self.extensions.items():
@@ -237,8 +239,24 @@ class ButcherTableau(_Record):
         if self.implicit is not None:
             _freeze(self, owner, implicit=(s, s))
             self._check_implicit(self.implicit, owner)
+        else:
+            self._check_orders(owner)
         if self.stiff is not None and self.stiff.n_stages != s:
             raise ValueError(f"{owner}: {self.stiff.name!r} has another number of stages")
+
+    def _check_orders(self, owner: str) -> None:
+        """Refuse an order of an explicit scheme that not even the integral of a function of time
+        has; the other conditions, those on A, are left to tests."""
+        step = np.ones(1)
+        _check_quadrature(self.b[None], self.c, self.order, step, f"{owner}: order of b")
+        if self.error is not None and self.embedded_order is not None:
+            what, weights = f"{owner}: embedded_order", self.error[None]
+            _check_quadrature(weights, self.abscissae, self.embedded_order, 0.0 * step, what)
+        for name, extension in self.extensions.items():
+            theta = np.linspace(0.0, 1.0, len(extension.rows) + 1)
+            nodes = np.concatenate([self.abscissae, extension.extra_c])
+            what = f"{owner}: order of extension {name!r}"
+            _check_quadrature(extension.weights(theta), nodes, extension.order, theta, what)
 
     def _check_implicit(self, implicit: FloatArray, owner: str) -> None:
         lead = self.lead
@@ -326,3 +344,18 @@ def _check_sums(rows: FloatArray, expected: FloatArray, what: str) -> None:
     wrong = np.abs(sums - expected) > _ROUNDING * (1.0 + np.abs(rows).sum(axis=1))
     for i in np.flatnonzero(wrong):
         raise ValueError(f"{what} is {sums[i]:.17g} instead of {expected[i]:.17g} (row {i})")
+
+
+def _check_quadrature(
+    rows: FloatArray, nodes: FloatArray, order: int, ends: FloatArray, what: str
+) -> None:
+    """Refuse weights, one row for each of the ``ends``, that do not integrate the powers below
+    ``order`` from 0 to there."""
+    for k in range(1, order + 1):
+        powers, exact = nodes ** (k - 1), ends**k / k
+        wrong = np.abs(rows @ powers - exact) > _ROUNDING * (1.0 + np.abs(rows) @ np.abs(powers))
+        if wrong.any():
+            raise ValueError(
+                f"{what} is {order}, but t^{k - 1} is integrated with an error of "
+                f"{np.abs(rows @ powers - exact).max():.1e}"
+            )

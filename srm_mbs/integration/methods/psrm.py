@@ -29,6 +29,12 @@ _FORMS = {"exact": ("split", "sweep", "fused"), "simple": ("sweep",)}
 """Corrections of each prediction, the default first."""
 
 
+def is_split(method: Method) -> bool:
+    """Whether ``method`` is the split PSRM itself, which the kernel has: the steps of a subclass
+    may be others."""
+    return type(method) is PSRM and method.correction == "split"
+
+
 @dataclass(frozen=True)
 class PSRM(DelegatingMethod):
     r"""Predicted sequential regularisation, in all its forms.

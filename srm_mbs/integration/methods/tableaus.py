@@ -8,6 +8,7 @@ S. P. Norsett, G. Wanner, *Solving Ordinary Differential Equations I*, 2nd editi
 
 from __future__ import annotations
 
+import copyreg
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -286,3 +287,14 @@ implicit rodas5p, and auto, which is dop853 and, where the problem is stiff, rod
 The names are the thesis': its heun is the explicit midpoint rule, c = (0, 1/2), b = (0, 1), and its
 trap, c = (0, 1), b = (1/2, 1/2), is what is often called Heun's method elsewhere.
 """
+
+
+def _reduced(tableau: ButcherTableau) -> tuple[Any, ...]:
+    """A scheme of the package by its name: a copy, also in another process, is the scheme itself,
+    by which saved runs know it."""
+    if TABLEAUS.get(tableau.name) is tableau:
+        return get_tableau, (tableau.name,)
+    return tableau.__reduce__()
+
+
+copyreg.pickle(ButcherTableau, _reduced)

@@ -19,6 +19,7 @@ import srm_mbs as srm
 from srm_mbs.formats.load import models_folder
 from srm_mbs.formats.planar.shapes import fitted, outline, slender
 from srm_mbs.model.coordinates import position_of
+from srm_mbs.model.laws import Curve
 from tests.support.bundled import finished, load
 from tests.support.snapshots import check_messages, refused
 
@@ -564,6 +565,36 @@ def test_a_variant_names_the_start_that_does_not_close() -> None:
     with pytest.raises(srm.AssemblyError) as caught:
         linkage.with_parameters(angle=0.1)
     assert caught.value.element == "planar.start"
+
+
+@pytest.mark.parametrize(
+    ("angle", "value", "said"),
+    [
+        ("rad", 30.0, "angle 30 of the joint 'O' .*: angles are in rad, and 30 degrees are 0.52"),
+        ("deg", 1000.0, "angle 1000 of the joint 'O' is more than two turns: angles are in deg$"),
+    ],
+)
+def test_a_start_of_more_than_two_turns_is_named_as_it_is_written(
+    angle: str, value: float, said: str
+) -> None:
+    with pytest.warns(srm.SrmWarning, match=rf"planar\.start: the {said}") as caught:
+        linkage = made(angle=angle, start={"O": "=turned"}, parameters={"turned": value})
+    assert len(caught) == 1
+    with pytest.warns(srm.SrmWarning, match=r"planar\.start: the angle \S+ of the joint 'O'"):
+        linkage.with_parameters(turned=1.01 * value)
+
+
+class Doubled(srm.Sine):
+    """A law with the fields of a sine, and twice its motion."""
+
+    def curve(self, initial: float = 0.0) -> Curve:
+        curve = super().curve(initial)
+        return replace(curve, sines=tuple((2.0 * a, w, p) for a, w, p in curve.sines))
+
+
+def test_a_drive_whose_law_no_description_can_have_is_refused() -> None:
+    with pytest.raises(srm.InputError, match=r"drives: Doubled\(.* is not a law that a descr"):
+        made(drives={"O": Doubled(amplitude=0.1, omega=3.0)})
 
 
 def test_a_linkage_is_sent_to_other_processes() -> None:

@@ -497,11 +497,21 @@ ERK4, DOPR54, DOP853 = TABLEAUS["erk4"], TABLEAUS["dopr54"], TABLEAUS["dop853"]
             {"dense": DOPR54.dense, "extensions": {"C1": DOPR54.dense}, "b": np.eye(6)[0]},
             "does not end at the end state",
         ),
+        ({"dense": None}, "dense is None, not a DenseExtension"),
+        ({"order": 6}, r"order of b is 6, but t\^5 is integrated with an error of"),
+        ({"embedded_order": 5}, r"embedded_order is 5, but t\^4 is integrated"),
     ],
 )
 def test_a_contradictory_tableau_is_refused_by_name(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=f"^tableau 'dopr54': .*{message}"):
         replace(DOPR54, **fields)
+
+
+def test_an_extension_that_falsely_claims_an_order_is_refused() -> None:
+    claim = replace(DOPR54.dense, order=5)
+    said = r"^tableau 'dopr54': order of extension 'C1' is 5, but t\^4 is integrated"
+    with pytest.raises(ValueError, match=said):
+        replace(DOPR54, dense=claim, extensions={"C1": claim})
 
 
 def test_an_extension_that_falsely_claims_to_be_smooth_is_refused() -> None:
@@ -566,7 +576,10 @@ def test_a_tableau_does_not_share_the_arrays_it_was_given() -> None:
 def test_a_copied_or_pickled_tableau_is_equal_and_read_only_as_well(
     name: str, clone: Callable[[ButcherTableau], ButcherTableau]
 ) -> None:
-    tableau, cloned = TABLEAUS[name], clone(TABLEAUS[name])
+    assert clone(TABLEAUS[name]) is TABLEAUS[name]  # by whose identity runs are saved
+    tableau = replace(TABLEAUS[name])  # one of the user's
+    cloned = clone(tableau)
+    assert cloned is not tableau
     assert cloned.dense is cloned.extensions[cloned.dense.name]
     for ours, theirs in zip(arrays_of(tableau), arrays_of(cloned), strict=True):
         assert ours.tolist() == theirs.tolist()

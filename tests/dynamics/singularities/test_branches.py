@@ -144,7 +144,8 @@ class Joined:
             self.first(t) if t < self.at else self.second(min(t - self.at, self.second.t[-1]))
             for t in times
         ]
-        return np.array([np.concatenate(state) for state in states])
+        rows = [np.concatenate(state) for state in states]
+        return np.reshape(rows, (len(times), self.steps.states.shape[1]))
 
 
 @pytest.mark.parametrize(("ratio", "switched"), [(-2.0, False), (0.0, True)])

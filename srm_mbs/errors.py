@@ -178,6 +178,12 @@ class InputError(SrmError, ValueError):
         return self
 
 
+def unwritable(path: str | os.PathLike[str], error: OSError) -> InputError:
+    """The error about a file or folder ``path`` that the system does not let be written."""
+    reason = error.strerror or error
+    return InputError(f"it cannot be written: {reason}", file=os.fspath(path), remedy=CHECK_WRITING)
+
+
 class naming:  # noqa: N801 - used as a function
     """Fill ``file`` and ``element`` into an :class:`InputError` that names none; a context manager,
     which a variant enters a dozen times."""

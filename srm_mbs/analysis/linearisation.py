@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
-from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs._typing import ComplexArray, FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import TangentChart, differences, tangent_basis
 from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
@@ -80,20 +80,20 @@ class Linearisation:
     chart: TangentChart = field(repr=False)
 
     @cached_property
-    def _eigen(self) -> tuple[Any, Any]:
+    def _eigen(self) -> tuple[FloatArray | ComplexArray, FloatArray | ComplexArray]:
         values, vectors = np.linalg.eig(self.A)
         order = np.lexsort((-values.imag, -values.real, np.round(np.abs(values.imag), 9)))
         return values[order], vectors[:, order]
 
     @property
-    def eigenvalues(self) -> Any:
-        """Eigenvalues of A (2 k,), complex, 1/s."""
+    def eigenvalues(self) -> FloatArray | ComplexArray:
+        """Eigenvalues of A (2 k,), 1/s; complex unless all of them are real."""
         return self._eigen[0]
 
     @cached_property
-    def modes(self) -> Any:
-        """Joint motions (nv, 2 k), complex, of each eigenvalue; the largest entry, in units, is
-        1."""
+    def modes(self) -> FloatArray | ComplexArray:
+        """Joint motions (nv, 2 k) of each eigenvalue, complex as they are; the largest entry, in
+        units, is 1."""
         k = len(self.coordinates)
         unit = self.chart.geometry.unit
         shapes = self.to_joints @ self._eigen[1][:k]

@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element
 
 import tomli_w
 
-from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, naming
+from srm_mbs.errors import InputError, get_logger, naming, unwritable
 from srm_mbs.formats.build import Reading, unassembled
 from srm_mbs.formats.files import checked_path, write_texts
 from srm_mbs.formats.load import Overrides, read
@@ -130,11 +130,7 @@ def write_description(
     try:
         write_texts({urdf: written, description: tomli_w.dumps(entries)})
     except OSError as error:
-        raise InputError(
-            f"it cannot be written: {error.strerror}",
-            file=str(error.filename or out),
-            remedy=CHECK_WRITING,
-        ) from error
+        raise unwritable(error.filename or out, error) from error
     log.info("written: %s and %s", description, urdf)
     notes = mechanism.notes
     if elsewhere:

@@ -10,6 +10,7 @@ from xml.etree.ElementTree import Element
 
 import pinocchio as pin
 
+from srm_mbs.assembly.regular_start import BEYOND_ROUNDING, bodies_at_start
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import (
     anchor_points,
@@ -73,6 +74,13 @@ def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:
     The size of a body is the largest distance of its joints, anchors and centre of mass from the
     origin of the joint that moves it.
     """
+    bodies = bodies_at_start(mechanism)
+    if (
+        bodies is not None
+        and bodies.least_gyration > BEYOND_ROUNDING * SMALLEST_GYRATION
+        and BEYOND_ROUNDING * bodies.largest_gyration < LARGEST_GYRATION
+    ):
+        return
     model = mechanism.model
     # Known from the analysis; 1 also where all points are one.
     scene = coordinate_units(mechanism, mechanism.q0, mechanism.v0).length

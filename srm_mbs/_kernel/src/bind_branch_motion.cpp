@@ -2,8 +2,6 @@
 #include <utility>
 #include <vector>
 
-#include <nanobind/stl/vector.h>
-
 #include "binding.hpp"
 #include "branch_motion.hpp"
 #include "branch_nodes.hpp"

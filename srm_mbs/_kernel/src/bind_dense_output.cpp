@@ -5,9 +5,6 @@
 #include <utility>
 #include <vector>
 
-#include <nanobind/stl/optional.h>
-#include <nanobind/stl/vector.h>
-
 #include "binding.hpp"
 #include "dense.hpp"
 #include "sigma_dips.hpp"

@@ -7,10 +7,6 @@
 #include <utility>
 #include <vector>
 
-#include <nanobind/stl/optional.h>
-#include <nanobind/stl/string.h>
-#include <nanobind/stl/vector.h>
-
 #include "binding.hpp"
 #include "dense.hpp"
 #include "errors.hpp"

@@ -7,12 +7,6 @@
 #include <utility>
 #include <vector>
 
-#include <nanobind/stl/array.h>
-#include <nanobind/stl/optional.h>
-#include <nanobind/stl/pair.h>
-#include <nanobind/stl/string.h>
-#include <nanobind/stl/vector.h>
-
 #include "algebra.hpp"
 #include "binding.hpp"
 #include "errors.hpp"

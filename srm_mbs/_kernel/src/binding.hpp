@@ -6,6 +6,12 @@
 #include <vector>
 
 #include <nanobind/nanobind.h>
+// All of them in all of these files, so that a type is converted in the same way everywhere.
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
 
 #include "model.hpp"
 #include "run.hpp"

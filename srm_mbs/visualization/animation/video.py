@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, safe_repr
+from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, safe_repr, unwritable
 from srm_mbs.formats.files import whole_file
 from srm_mbs.integration.dense_output import checked_time
 from srm_mbs.model.numbers import positive_number
@@ -498,9 +498,7 @@ def _write_frames(folder: Path, pictures: Iterable[bytes]) -> None:
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise InputError(
-            f"it cannot be written: {error.strerror}", file=str(folder), remedy=CHECK_WRITING
-        ) from error
+        raise unwritable(folder, error) from error
     for number, picture in enumerate(pictures, 1):
         write_file(folder / FRAME.format(number), picture)
 
@@ -575,7 +573,5 @@ def _encode(encoder: str, pictures: Sequence[bytes], fps: float, path: Path) -> 
                     remedy="Write a .gif, which needs no encoder",
                 )
     except OSError as error:
-        raise InputError(
-            f"it cannot be written: {error.strerror}", file=str(path), remedy=CHECK_WRITING
-        ) from error
+        raise unwritable(path, error) from error
     log.info("written: %s", path)

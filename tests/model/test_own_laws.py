@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.analysis.summary import drive_rows, force_rows
 from srm_mbs.model.laws import Curve, Law
 from tests.support.backends import on_both
 
@@ -144,3 +145,10 @@ def test_a_run_with_a_law_of_ones_own_is_not_saved_and_says_so(law: Law, tmp_pat
         with pytest.raises(srm.InputError, match=f"the law of '{name}' is not one of the"):
             run.save(tmp_path / "run.npz")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_law_of_ones_own_is_listed_by_its_type() -> None:
+    law = TwoSines()
+    mechanism = replace(driven(law), forces=[srm.JointTorque("rod", law=law, name="push")])
+    assert list(drive_rows(mechanism)) == [("crank", "two_sines", "crank", "of the user")]
+    assert list(force_rows(mechanism)) == [("push", "torque", "rod", "torque 1 N m, law two_sines")]

@@ -398,12 +398,18 @@ class MechanismData(ResultOwner):
     def moved(self, q: Any, v: Any) -> Self:
         """The same mechanism at another state, q (nq,) and v (nv,), of its motion: unlike with
         :meth:`with_state`, drives continue their motion."""
-        changed = self.with_state(q, v, STATE_ARGUMENTS)
+        changed = self._at(q, v, STATE_ARGUMENTS)
         return changed.with_drive_curves(self.drive_curves) if self.drives else changed
 
-    def with_state(self, q0: Any, v0: Any, names: tuple[str, str] = START_ARGUMENTS) -> Self:
-        """The same mechanism with another initial state, q0 (nq,) and v0 (nv,), which messages call
-        ``names``."""
+    def with_state(self, q0: Any, v0: Any) -> Self:
+        """The same mechanism with another initial state, q0 (nq,) and v0 (nv,).
+
+        It shares the analysis of this one, if there is one, in units of the new state.
+        """
+        return self._at(q0, v0, START_ARGUMENTS)
+
+    def _at(self, q0: Any, v0: Any, names: tuple[str, str]) -> Self:
+        """:meth:`with_state`, whose messages call the state ``names``."""
         changed = self._at_no_start()
         changed._take_start(q0, v0, names)
         return changed

@@ -27,7 +27,7 @@ from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.copies import copied
 from srm_mbs.model.drives import Drive, positions
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement, UserForce
-from srm_mbs.model.laws import Curve, Law
+from srm_mbs.model.laws import Curve, Law, is_of_package
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import checked_name, vector_elements
 from srm_mbs.model.pinocchio_constraints import (
@@ -521,10 +521,11 @@ class MechanismData(ResultOwner):
         for element, law in _laws(self):
             last = law.span[1]
             if last < t_end:
+                what = "table" if is_of_package(law) else "law"
                 raise InputError(
-                    f"its table ends at t = {last:g} s, before the run, at {t_end:g} s",
+                    f"its {what} ends at t = {last:g} s, before the run, at {t_end:g} s",
                     element=element,
-                    remedy="Extend the table, or end the run earlier",
+                    remedy=f"Extend the {what}, or end the run earlier",
                 )
 
     def breakpoints(self, t0: float, t_end: float) -> Sequence[float]:

@@ -240,16 +240,16 @@ def checked_elements(
         parts: tuple[Any, ...] = tuple(given) if several else (given,)
     except Exception:  # objects may raise anything
         several, parts = False, (given,)
-    for i, part in enumerate(parts):
-        base = next((known.__name__ for known in types if isinstance(part, known)), "")
-        if base and type(part) not in types:
-            raise InputError(
-                f"the class {safe_repr(type(part).__name__)} inherits from {base}, of which the "
-                "equations read the fields alone",
-                element=f"{what}s[{i}]",
-                remedy=f"Give an object of {base} itself, which a function may make",
-            )
     if not several or not all(type(part) in types for part in parts):
+        for i, part in enumerate(parts):
+            base = next((known.__name__ for known in types if isinstance(part, known)), "")
+            if base and type(part) not in types:
+                raise InputError(
+                    f"the class {safe_repr(type(part).__name__)} inherits from {base}, of which "
+                    "the equations read the fields alone",
+                    element=f"{what}s[{i}]",
+                    remedy=f"Give an object of {base} itself, which a function may make",
+                )
         raise InputError(
             f"{what}s = {safe_repr(given)} is not a list of {what}s",
             element=f"{what}s",

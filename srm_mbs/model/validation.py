@@ -312,8 +312,10 @@ def _frozen_array(values: Any, size: int, name: str) -> FloatArray:
     array = finite_array(values, (size,))
     if array is None:
         remedy = f"Give {size} finite numbers"
+        kind = name[0]  # q or v
+        if hasattr(values, kind):  # an assembly or an equilibrium
+            remedy = f"Give its {kind}"
         if isinstance(values, Mapping):
-            kind = name[0]  # q or v
             remedy += f"; srm.assemble(mechanism, {kind}=...) makes them from values of joints"
         raise InputError(
             f"{name} does not consist of {size} finite numbers", element=name, remedy=remedy

@@ -31,7 +31,6 @@ from srm_mbs.errors import InputError, counted, get_logger, safe_repr
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import finite_number, positive_integer, positive_number
-from srm_mbs.model.validation import STATE_ARGUMENTS
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 log = get_logger(__name__)
@@ -238,7 +237,7 @@ def linearise(
     if q is None:
         q, v = mechanism.q0, mechanism.v0 if v is None else v
     v = np.zeros(mechanism.model.nv) if v is None else v
-    mechanism = mechanism.with_state(q, v, STATE_ARGUMENTS)
+    mechanism = mechanism.moved(q, v)
     q, v = np.array(mechanism.q0), np.array(mechanism.v0)
     geometry = ClosureGeometry(mechanism, q)
     unit, nv = geometry.unit, mechanism.model.nv

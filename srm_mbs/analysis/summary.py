@@ -21,6 +21,7 @@ from srm_mbs.integration.kernel.backend import backend, code_status
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import JointRow, LoopClosure
 from srm_mbs.model.coordinates import position_of
+from srm_mbs.model.laws import is_of_package
 from srm_mbs.simulation.result import SimulationResult
 
 JOINT_TYPES = {
@@ -309,8 +310,9 @@ def drive_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str]]:
         if drive.a is not None and drive.b is not None:
             along = "distance" if drive.axis is None else f"along {vector_text(drive.axis)}"
             place = f"{_anchor(drive.a)}, {_anchor(drive.b)}, {along}"
-        values = []
-        for key in fields(drive.law):  # type: ignore[arg-type]
+        ours = is_of_package(drive.law)
+        values = [] if ours else ["of the user"]
+        for key in fields(drive.law) if ours else ():  # type: ignore[arg-type]
             value = getattr(drive.law, key.name)
             if isinstance(value, Sequence) and len(value) > MAX_LISTED:
                 values.append(f"{key.name} {value[0]:.6g} .. {value[-1]:.6g} ({len(value)})")

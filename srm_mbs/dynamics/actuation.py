@@ -66,7 +66,16 @@ class ActuatorController:
         """The controls (actuators,) before they are clipped."""
         out = self._constant.copy()
         for at, function in self._functions.items():
-            out[at] = _control(self._names[at], function(t), t)
+            name = self._names[at]
+            try:
+                value = function(t)
+            except Exception as error:
+                raise ControllerError(
+                    f"the control of the actuator {safe_repr(name)}, a function of t, raised "
+                    f"{safe_repr(error)} at t = {t:.6g} s",
+                    t,
+                ) from error
+            out[at] = _control(name, value, t)
         if self._law is None:
             return out
         given = self._law(t, q, v)

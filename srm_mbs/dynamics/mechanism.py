@@ -15,7 +15,7 @@ from srm_mbs.dynamics.constraints.structure import Structure, structure_of
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.laws import Curve
 from srm_mbs.model.mechanism import MechanismData, per_start
-from srm_mbs.model.validation import START_ARGUMENTS, STATE_ARGUMENTS
+from srm_mbs.model.validation import STATE_ARGUMENTS
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,13 +86,9 @@ class Mechanism(MechanismData):
         """Names of the closure rows that are zero wherever the loops are closed; left out."""
         return self.structure.redundant_rows
 
-    def with_state(self, q0: Any, v0: Any, names: tuple[str, str] = START_ARGUMENTS) -> Self:
-        """The same mechanism with another initial state, q0 (nq,) and v0 (nv,), which messages call
-        ``names``.
-
-        It shares the analysis of this one, if there is one, in units of the new state.
-        """
-        changed = super().with_state(q0, v0, names)
+    def _at(self, q0: Any, v0: Any, names: tuple[str, str]) -> Self:
+        """As there, with the analysis of this one."""
+        changed = super()._at(q0, v0, names)
         structure = structure_of.kept(self)
         if structure is not None:
             structure_of.keep(changed, structure.at(changed))
@@ -101,7 +97,7 @@ class Mechanism(MechanismData):
     def continued(self, q: Any, v: Any) -> Self:
         """The same mechanism at another state, q (nq,) and v (nv,), of a run from its own: drives
         continue their motion, and the units remain those of the run."""
-        changed = super().with_state(q, v, STATE_ARGUMENTS)
+        changed = super()._at(q, v, STATE_ARGUMENTS)
         structure_of.keep(changed, self.structure)
         return changed.with_drive_curves(self.drive_curves) if self.drives else changed
 

@@ -419,14 +419,14 @@ def check_law(law: Law) -> None:
         )
     try:
         first, last = law.span
-        ascending = bool(first < last)
+        covers = bool(first <= 0.0 < last)
     except Exception:  # objects may raise anything
-        ascending = False
-    if not ascending:
+        covers = False
+    if not covers:
         raise _fault(
             law,
-            f"its span {safe_repr(law.span)} is not a first and a last time",
-            "Give two numbers (s), which may be infinite",
+            f"its span {safe_repr(law.span)} is not from t = 0 or before to a later time",
+            "Give a first and a last time (s), which may be infinite",
         )
 
 

@@ -27,7 +27,7 @@ from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.copies import copied
 from srm_mbs.model.drives import Drive, positions
 from srm_mbs.model.forces import FORCE_TYPES, ForceElement, UserForce
-from srm_mbs.model.laws import Curve, Law
+from srm_mbs.model.laws import Curve, Law, is_of_package
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import checked_name, vector_elements
 from srm_mbs.model.pinocchio_constraints import (
@@ -398,12 +398,18 @@ class MechanismData(ResultOwner):
     def moved(self, q: Any, v: Any) -> Self:
         """The same mechanism at another state, q (nq,) and v (nv,), of its motion: unlike with
         :meth:`with_state`, drives continue their motion."""
-        changed = self.with_state(q, v, STATE_ARGUMENTS)
+        changed = self._at(q, v, STATE_ARGUMENTS)
         return changed.with_drive_curves(self.drive_curves) if self.drives else changed
 
-    def with_state(self, q0: Any, v0: Any, names: tuple[str, str] = START_ARGUMENTS) -> Self:
-        """The same mechanism with another initial state, q0 (nq,) and v0 (nv,), which messages call
-        ``names``."""
+    def with_state(self, q0: Any, v0: Any) -> Self:
+        """The same mechanism with another initial state, q0 (nq,) and v0 (nv,).
+
+        It shares the analysis of this one, if there is one, in units of the new state.
+        """
+        return self._at(q0, v0, START_ARGUMENTS)
+
+    def _at(self, q0: Any, v0: Any, names: tuple[str, str]) -> Self:
+        """:meth:`with_state`, whose messages call the state ``names``."""
         changed = self._at_no_start()
         changed._take_start(q0, v0, names)
         return changed
@@ -515,10 +521,11 @@ class MechanismData(ResultOwner):
         for element, law in _laws(self):
             last = law.span[1]
             if last < t_end:
+                what = "table" if is_of_package(law) else "law"
                 raise InputError(
-                    f"its table ends at t = {last:g} s, before the run, at {t_end:g} s",
+                    f"its {what} ends at t = {last:g} s, before the run, at {t_end:g} s",
                     element=element,
-                    remedy="Extend the table, or end the run earlier",
+                    remedy=f"Extend the {what}, or end the run earlier",
                 )
 
     def breakpoints(self, t0: float, t_end: float) -> Sequence[float]:

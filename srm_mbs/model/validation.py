@@ -240,16 +240,16 @@ def checked_elements(
         parts: tuple[Any, ...] = tuple(given) if several else (given,)
     except Exception:  # objects may raise anything
         several, parts = False, (given,)
-    for i, part in enumerate(parts):
-        base = next((known.__name__ for known in types if isinstance(part, known)), "")
-        if base and type(part) not in types:
-            raise InputError(
-                f"the class {safe_repr(type(part).__name__)} inherits from {base}, of which the "
-                "equations read the fields alone",
-                element=f"{what}s[{i}]",
-                remedy=f"Give an object of {base} itself, which a function may make",
-            )
     if not several or not all(type(part) in types for part in parts):
+        for i, part in enumerate(parts):
+            base = next((known.__name__ for known in types if isinstance(part, known)), "")
+            if base and type(part) not in types:
+                raise InputError(
+                    f"the class {safe_repr(type(part).__name__)} inherits from {base}, of which "
+                    "the equations read the fields alone",
+                    element=f"{what}s[{i}]",
+                    remedy=f"Give an object of {base} itself, which a function may make",
+                )
         raise InputError(
             f"{what}s = {safe_repr(given)} is not a list of {what}s",
             element=f"{what}s",
@@ -312,8 +312,10 @@ def _frozen_array(values: Any, size: int, name: str) -> FloatArray:
     array = finite_array(values, (size,))
     if array is None:
         remedy = f"Give {size} finite numbers"
+        kind = name[0]  # q or v
+        if hasattr(values, kind):  # an assembly or an equilibrium
+            remedy = f"Give its {kind}"
         if isinstance(values, Mapping):
-            kind = name[0]  # q or v
             remedy += f"; srm.assemble(mechanism, {kind}=...) makes them from values of joints"
         raise InputError(
             f"{name} does not consist of {size} finite numbers", element=name, remedy=remedy

@@ -633,8 +633,7 @@ def _switched(
             "a switch leads to something else than a mechanism with the same joints",
             remedy="Give a mechanism made from this one, for example with dataclasses.replace",
         )
-    q, v = (q if switch.q is None else switch.q), (v if switch.v is None else switch.v)
-    new = new.with_state(q, v, STATE_ARGUMENTS)
+    new = new.moved(q if switch.q is None else switch.q, v if switch.v is None else switch.v)
     new = new.with_drive_curves(_curves_from(t, mechanism, new))
     given = new.start_state
     system = make_system(new)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from srm_mbs.errors import InputError, get_logger
+from srm_mbs.errors import InputError, KnownKeys, get_logger
 from srm_mbs.formats.files import whole_file
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.simulation.csv_export import write_table
@@ -96,7 +96,7 @@ class Sweep:
         )
         for row in rows:
             names |= dict.fromkeys(row)
-        return {name: _column([row.get(name) for row in rows]) for name in names}
+        return KnownKeys((name, _column([row.get(name) for row in rows])) for name in names)
 
     def to_pandas(self) -> pandas.DataFrame:
         """The table as a data frame.

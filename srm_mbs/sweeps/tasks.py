@@ -51,8 +51,10 @@ def standard_measures(solution: Solution) -> dict[str, Value]:
             last = len(solution.t) - 1
             ends: Any = slice(None, None, last) if last else [0, 0]
             t, q, v = solution.t[ends], solution.q[ends], solution.v[ends]
-            g, _ = solution.observables.closure_errors(t[1:], q[1:], v[1:])
-            drift, energy = np.sqrt(g[0] @ g[0]), solution.observables.energies(q, v).sum(axis=1)
+            # Of a run with event actions only its segments have them.
+            observables = solution.segments[0].observables
+            g, _ = observables.closure_errors(t[1:], q[1:], v[1:])
+            drift, energy = np.sqrt(g[0] @ g[0]), observables.energies(q, v).sum(axis=1)
         else:
             read = solution.at(solution.span)
             drift, energy = read.drift[1, 0], read.energy

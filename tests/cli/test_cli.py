@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -22,6 +23,7 @@ from srm_mbs.analysis.summary import joint_rows
 from tests.cli.conftest import Describe
 from tests.support.commands import ROOT, command, row, run, run_apart
 from tests.support.urdf_files import tree
+from tools.pages import DOCS, blocks
 
 BOX = """<robot name="box"><link name="box"><inertial><mass value="1"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
@@ -528,6 +530,21 @@ def test_plot_writes_beside_the_run_unless_told_otherwise(saved_run: Path, tmp_p
     assert run("plot", saved_run, "--out", other) == f"written: {other}\n"
     assert beside.stat().st_size > 5000
     assert other.stat().st_size > 5000
+
+
+def test_the_commands_of_the_page_of_plots_write_their_pictures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (DOCS / "plots.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    lines = [line for kind, text in blocks(page) if kind == "sh" for line in text.splitlines()]
+    assert len(lines) > 3
+    for line in lines:
+        program, *words = shlex.split(line)
+        assert program == "srm-mbs"
+        run(*words)
+    for name in ("run_state.png", "path.pdf", "poses.pdf", "hinge.pdf"):
+        assert (tmp_path / name).stat().st_size > 5000
 
 
 @POSIX

@@ -280,6 +280,7 @@ def test_a_mechanism_without_actuators_has_no_controller() -> None:
     ("controls", "problem"),
     [
         ({"hip": lambda t: "x"}, "the control of the actuator 'hip' is 'x' at t = 0 s"),
+        ({"hip": lambda t, q, v: 0.0}, "actuator 'hip', a function of t, raised TypeError("),
         (lambda t, q, v: 3.0, "the function of the controls returned 3.0 at t = 0 s"),
         (lambda t, q, v: {"hop": 1.0}, "names the actuator 'hop' at t = 0 s"),
         (lambda t, q, v: {"hip": None}, "the control of the actuator 'hip' is None"),

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.analysis.summary import drive_rows, force_rows
 from srm_mbs.model.laws import Curve, Law
 from tests.support.backends import on_both
 
@@ -120,12 +121,12 @@ def test_a_law_whose_knots_are_no_times_is_refused(knots: Any) -> None:
         srm.Drive(Given(Curve(), knots), joint="crank")
 
 
-@pytest.mark.parametrize("span", [None, (1.0,), (np.nan, 1.0), (1.0, 0.0), ("a", 1.0)])
+@pytest.mark.parametrize("span", [None, (1.0,), (np.nan, 1.0), (0.0, 0.0), (0.1, 2.0), ("a", 1.0)])
 def test_a_law_whose_span_is_none_is_refused(span: Any) -> None:
     class Spanned(Given):
         span = property(lambda law: span)  # type: ignore[assignment]
 
-    with pytest.raises(srm.InputError, match=r"its span .* is not a first and a last time"):
+    with pytest.raises(srm.InputError, match=r"its span .* is not from t = 0 or before"):
         srm.Drive(Spanned(Curve()), joint="crank")
 
 
@@ -144,3 +145,18 @@ def test_a_run_with_a_law_of_ones_own_is_not_saved_and_says_so(law: Law, tmp_pat
         with pytest.raises(srm.InputError, match=f"the law of '{name}' is not one of the"):
             run.save(tmp_path / "run.npz")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_law_of_ones_own_is_listed_by_its_type() -> None:
+    law = TwoSines()
+    mechanism = replace(driven(law), forces=[srm.JointTorque("rod", law=law, name="push")])
+    assert list(drive_rows(mechanism)) == [("crank", "two_sines", "crank", "of the user")]
+    assert list(force_rows(mechanism)) == [("push", "torque", "rod", "torque 1 N m, law two_sines")]
+
+
+def test_a_run_that_is_longer_than_a_law_of_ones_own_is_refused() -> None:
+    class Short(TwoSines):
+        span = (0.0, 0.5)  # type: ignore[assignment]
+
+    with pytest.raises(srm.InputError, match=r"'crank': its law ends at t = 0\.5 s"):
+        srm.simulate(driven(Short()), 1.0)

@@ -256,6 +256,16 @@ def test_invalid_options_are_refused_before_any_stepping(four_bar: srm.Mechanism
     check_messages("options", messages)
 
 
+def test_an_assembly_as_initial_state_is_told_which_part_of_it_to_give(
+    four_bar: srm.Mechanism,
+) -> None:
+    start: Any = srm.assemble(four_bar, {"crank": 2.0})
+    with pytest.raises(srm.InputError, match=r"Give its q$"):
+        srm.simulate(four_bar, 1.0, q0=start, v0=start.v)
+    with pytest.raises(srm.InputError, match=r"Give its v$"):
+        srm.simulate(four_bar, 1.0, q0=start.q, v0=start)
+
+
 @pytest.mark.parametrize("backend", ["kernel", "python"])
 @pytest.mark.parametrize(("step", "longest"), [(0.1, 0.1), (0.1, 0.05), (0.02, 0.002)])
 def test_fixed_steps_that_a_longest_step_divides_reach_the_end(

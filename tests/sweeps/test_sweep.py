@@ -281,6 +281,30 @@ def test_joint_values_are_assembled_case_by_case(four_bar: srm.Mechanism) -> Non
     assert sweep.table["q.crank"].tolist() == [0.6, 0.9]
 
 
+@pytest.mark.parametrize("speed", [1.0, 4.0])
+def test_runs_have_their_measures_whether_an_action_happens_or_not(
+    four_bar: srm.Mechanism, speed: float
+) -> None:
+    """The crank starts at 1 rad, and passes 2 rad within 1 s with 4 rad/s only."""
+    bounce = srm.Event(lambda t, q, v: q[0] - 2.0, direction=1, action=lambda t, q, v: (q, -v))
+    sweep = srm.sweep(four_bar, [{"v": {"crank": speed}}], 1.0, events=bounce)
+    assert sweep.failures == ()
+    start = srm.assemble(four_bar, {"crank": 1.0}, {"crank": speed})
+    run = srm.simulate(four_bar, 1.0, q0=start.q, v0=start.v, events=bounce)
+    assert len(run.segments) == (1 if speed == 1.0 else 2)
+    assert sweep.table["steps"][0] == run.stats.steps
+    assert sweep.table["drift"][0] == pytest.approx(run.drift[-1, 0], abs=1e-14)
+    assert sweep.table["energy_change"][0] == pytest.approx(run.energy[-1] - run.energy[0])
+
+
+def test_a_column_that_is_not_in_the_table_is_answered_with_those_that_are(
+    four_bar: srm.Mechanism,
+) -> None:
+    table = srm.sweep(four_bar, [{"v": {"crank": 1.0}}], 0.1).table
+    with pytest.raises(KeyError, match=r"no 'enrgy'\. Known: case, v\.crank, success"):
+        table["enrgy"]
+
+
 def test_controllers_and_ends_come_from_the_case() -> None:
     def braked(gain: float, t_end: float) -> tuple[srm.Mechanism, dict[str, Any]]:
         return pendulum(), {"controller": lambda t, q, v: -gain * v, "t_end": t_end}

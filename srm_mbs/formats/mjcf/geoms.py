@@ -87,7 +87,9 @@ def read_geom(
     InputError
         Naming the geom.
     """
-    given = values.resolved(node, childclass, f"body {body!r}, geom {node.get('name', '')!r}")
+    name = node.get("name")
+    which = f"geom {name!r}" if name else "a <geom> without name"
+    given = values.resolved(node, childclass, f"body {body!r}, {which}")
     kind = given.choice("type", GEOMS)
     if "mesh" in given and "type" not in given:
         kind = "mesh"

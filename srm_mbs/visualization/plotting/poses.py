@@ -411,7 +411,7 @@ def _axis_name(direction: FloatArray) -> str:
 def _note(solution: SimulationResult, times: FloatArray, at: Any, crank: str | None) -> str:
     if crank is not None:
         unit = "degrees" if is_angle(solution.mechanism.model, crank) else "m"
-        values = ", ".join(f"{value:g}" for value in at)
+        values = ", ".join(f"{float(value):g}" for value in at)  # texts on the command line
         return f"Positions where {crank} is at {values} {unit}; earlier ones are paler."
     values = ", ".join(f"{t:.4g}" for t in times)
     return f"Positions at t = {values} s; earlier ones are paler."

@@ -445,7 +445,8 @@ class LoopClosure:
     @property
     def _element(self) -> str:
         """Its name in messages."""
-        return f"loop {safe_repr(self.name or self.type_name)}"
+        named = isinstance(self.name, str) and self.name
+        return f"loop {safe_repr(named or self.type_name)}"
 
     def _fault(self, problem: str, remedy: str) -> InputError:
         return InputError(problem, element=self._element, remedy=remedy)

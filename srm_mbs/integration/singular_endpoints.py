@@ -70,6 +70,10 @@ MULTIPLIER_CONVERGED = 1e-11
 MULTIPLIER_TOLERANCE = 1e-6
 """Largest relative change of the multipliers in the last iteration; rounding may end the
 contraction early."""
+VANISHING_MULTIPLIER = 1e-9
+"""The same over the square of the velocity (rad/s, scene diagonals/s), for multipliers that vanish:
+what is left of them is rounding of terms of that size.  Over a block it changes the velocity by a
+fifth of this part."""
 ARRIVAL_BLOCKS = (1, 2, 4)
 """Numbers of blocks that an arrival tries in turn, until the error is small enough; where rounding
 prevents that, the best of them is used."""
@@ -328,7 +332,9 @@ class BranchMotion:
                 continue
             if change <= MULTIPLIER_CONVERGED * largest or not change < 0.5 * old:
                 break
-        return points if change <= MULTIPLIER_TOLERANCE * largest else None
+        speed = float(np.abs(start.rate[: len(unit)] / unit).max())
+        allowed = max(MULTIPLIER_TOLERANCE * largest, VANISHING_MULTIPLIER * speed**2)
+        return points if change <= allowed else None
 
     def _block_time(self, rate: FloatArray, longest: float) -> float:
         """Time (s) in which the motion covers BLOCK_MOTION, at most ``longest``."""

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs.integration import singular_endpoints
 from srm_mbs.integration.control.placement import error_of_parabola
 from tests.support import reduced, slider_crank
+from tests.support.backends import on_both
 from tests.support.bundled import load
 from tests.support.lockstep import compare
 from tests.support.slider_crank import PERIOD, START, off_branch
@@ -84,6 +87,40 @@ def test_a_run_may_end_on_a_singular_configuration(tableau: str, tol: float, bes
     solution = srm.simulate(load("slider_crank"), t_end, tableau=tableau, rtol=tol, atol=tol)
     assert solution.stats.steps < 60
     assert slider_crank.error(solution) < tol
+
+
+@on_both
+@pytest.mark.parametrize("rtol", [1e-5, 1e-6, 1e-8])
+def test_a_run_may_end_on_a_singular_configuration_after_one_step(
+    rtol: float, backend: str
+) -> None:
+    for angle in np.linspace(0.02, 0.46, 10):
+        for rate in (4.0, 12.0):
+
+            def stretched(t: float, y: Any) -> Any:
+                return y[0]
+
+            stretched.terminal = True  # type: ignore[attr-defined]
+            run = solve_ivp(
+                reduced.parallelogram(),
+                (0.0, 1.0),
+                [-angle, rate],
+                "DOP853",
+                events=stretched,
+                rtol=1e-13,
+                atol=1e-13,
+            )
+            solution = srm.simulate(
+                load("parallelogram"),
+                run.t[-1],
+                q0=[-angle, angle, -angle],
+                v0=[rate, -rate, rate],
+                rtol=rtol,
+                backend=backend,
+            )
+            assert solution.success
+            expected = run.y[1, -1] * np.array([1.0, -1.0, 1.0])
+            assert np.abs(solution.v[-1] - expected).max() < 30.0 * rtol * rate
 
 
 @EVERYWHERE

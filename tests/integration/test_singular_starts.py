@@ -22,7 +22,13 @@ from tests.support import reduced, slider_crank
 from tests.support.backends import on_both
 from tests.support.bundled import load
 from tests.support.convergence import fitted_order
-from tests.support.mechanisms import ball_dead_point, distance, floating_slider_crank
+from tests.support.mechanisms import (
+    add_link,
+    along_x,
+    ball_dead_point,
+    distance,
+    floating_slider_crank,
+)
 from tests.support.reduced import error_at_end
 from tests.support.singularities import singular_at
 from tests.support.slider_crank import state
@@ -83,6 +89,23 @@ def test_an_n_four_bar_starts_where_it_has_lost_n_rows(n: int) -> None:
     assert error_at_end(solution, reduced.n_four_bar(n), [0.0, -4.0]) < 1e-8
     cranks = [mechanism.joint(f"crank_{i}").idx_q for i in range(n + 1)]
     assert np.abs(solution.q[:, cranks] - solution.q[:, :1]).max() < 1e-8
+
+
+@on_both
+@pytest.mark.parametrize("angle", [0.0, PI])
+def test_a_start_without_any_force_is_left_uniformly(angle: float, backend: str) -> None:
+    """Two equal cranks and a massless coupler without gravity: the multiplier is 0."""
+    model = pin.Model()
+    model.gravity.linear = np.zeros(3)
+    for name, at in (("left", 0.0), ("right", 1.5)):
+        add_link(model, 0, pin.JointModelRY(), name, at=along_x(at))
+    tips = (srm.Anchor(name, xyz=(1.0, 0.0, 0.0)) for name in ("left", "right"))
+    coupler = srm.LoopClosure("distance", *tips, length=1.5)
+    start = srm.Mechanism(model, (coupler,), q0=[angle, angle], v0=[5.9, 5.9])
+    solution = srm.simulate(start, 2.0, rtol=1e-9, backend=backend)
+    assert solution.success
+    assert np.abs(solution.q[-1] - angle - 11.8).max() < 1e-9
+    assert np.abs(solution.v - 5.9).max() < 1e-9
 
 
 def test_a_spatial_mechanism_starts_in_its_dead_point_while_its_rod_spins() -> None:

@@ -249,6 +249,8 @@ StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepRe
             result->sigmas.back() < constants_.singular_end) {
             arrival_ = Arrival::due;
             redo_ = h;
+            // The first step of a run knows no other slope, and would prepare nothing.
+            if (slope_ == 0.0) slope_ = slope;
             ++replaced;
             return StepDecision::replaced;
         }
@@ -265,6 +267,11 @@ StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepRe
     const StepDecision decision = inner_->decide(proposal, result);
     redo_ = 0.0;
     redone_ = 0;
+    if (decision == StepDecision::rejected && arrival_ < first_arrival_) {
+        // What was prepared without nodes was another step to the end.
+        arrival_ = first_arrival_;
+        lost_branch_ = false;
+    }
     if (decision == StepDecision::accepted && result) {
         slope_ = std::max(slope, 0.5 * slope_);
         turning_ = !result->quiet && result->sigmas.back() < constants_.monitored_below &&

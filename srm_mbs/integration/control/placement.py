@@ -454,6 +454,8 @@ class SingularityPlacement(ControlWrapper):
             ends_beside = last and result.sigmas[-1] < SINGULAR_END_SIGMA
             if ends_beside and self._arrival is Arrival.WATCHED and not self._lingering:
                 self._arrival, self._redo = Arrival.DUE, h
+                # The first step of a run knows no other slope, and would prepare nothing.
+                self._slope = self._slope or slope
                 self.replaced += 1
                 return StepDecision.REPLACED
             if self._redone < MAX_REDONE and not (self._known or self._lingering):
@@ -466,6 +468,9 @@ class SingularityPlacement(ControlWrapper):
         decision = self._inner.decide(proposal, result)
         self._redo = None
         self._redone = 0
+        if decision is StepDecision.REJECTED and self._arrival < self._watched:
+            # What was prepared without nodes was another step to the end.
+            self._arrival, self._lost_branch = self._watched, False
         if decision is StepDecision.ACCEPTED and result is not None:
             slowest = 0.5 * self._slope
             self._slope = slope if slope > slowest else slowest

@@ -7,7 +7,8 @@ milliseconds, the least of the repeats, each on a fresh run: other programs only
 ``certify`` is without its two ``reruns``, and includes the passages and the balance where it reads
 them, and its text; ``of run`` and ``of runs`` are its parts, in per cent, of the run and of all
 three runs.
-``n_four_bar_N`` is ``srm.n_four_bar(N)``.
+``n_four_bar_N`` is ``srm.n_four_bar(N)``; ``swing_X`` is a parallelogram that swings up to X rad
+before its change points, on both sides.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from unittest import mock
 
 import srm_mbs as srm
 from srm_mbs.analysis.accuracy import error_estimate
+from tests.support.turning import lifted
 
 MODELS = (
     "stewart_platform",
@@ -33,12 +35,17 @@ MODELS = (
     "delta_robot",
     "bricard",
     "parallelogram",
+    "swing_1e-3",
+    "swing_1e-5",
 )
 COUNTED = "n_four_bar_"
+TURNING = "swing_"
 
 
 def mechanism_of(name: str) -> srm.Mechanism:
-    """A bundled mechanism, or the N-four-bar ``n_four_bar_N``."""
+    """A bundled mechanism, ``n_four_bar_N`` or ``swing_X``."""
+    if name.startswith(TURNING):
+        return lifted(-float(name.removeprefix(TURNING))).mechanism
     if name.startswith(COUNTED):
         return srm.n_four_bar(int(name.removeprefix(COUNTED)))
     return srm.load(name)

@@ -377,8 +377,9 @@ def simulate(
     controller
         (t, q, v) -> generalised forces (nv,), N and N m, or a mapping {joint: force} with numbers
         for joints of one degree of freedom and arrays (joint.nv,) for others; joints that it does
-        not name have none.  Called at every stage; with ``sample_time`` at 0, T, 2 T, ... only,
-        and what it returned is held in between.
+        not name have none.  Called at every stage, of rejected steps too; with ``sample_time`` at
+        0, T, 2 T, ... only, and what it returned is held in between, as one needs that has memory
+        (an integral term, a filter) or adds noise.
     sample_time
         T (s) of a sampled controller.  Steps end on the samples.
     breakpoints : (k,)
@@ -478,12 +479,12 @@ def solve_dae(
         (GB)^-1; the last one carries B y, form (2.4) of the thesis.  Isolated singularities of
         G B are passed by the split form, and by sweeps with T = (GB)^-1: restarted ones with
         ``carry`` at a tolerance of 1e-4 with errors below 2e-4, at 1e-6 below 2e-6
-        (``tests/test_dae.py``); without it they turn off.  Sweeps with own histories, whose first
-        one is off the constraints by O(eps), would leave on another branch of g = 0; next to the
-        singularity they are restarted, and the message says when.  Sweeps that carry y, which is
-        not bounded there, would leave on another branch, however small the step: x' is compared
-        across every passage, and a run with sweeps that took another branch fails there, with a
-        message that names the remedy.
+        (``tests/simulation/test_dae.py``); without it they turn off.  Sweeps with own histories,
+        whose first one is off the constraints by O(eps), would leave on another branch of g = 0;
+        next to the singularity they are restarted, and the message says when.  Sweeps that carry y,
+        which is not bounded there, would leave on another branch, however small the step: x' is
+        compared across every passage, and a run with sweeps that took another branch fails there,
+        with a message that names the remedy.
     tableau
         Runge-Kutta scheme for a method given by name.
     rtol
@@ -522,12 +523,13 @@ def solve_dae(
     Raises
     ------
     InputError
-        For invalid input, before any stepping.
+        For invalid input, before any stepping, and functions of the problem that cannot be used at
+        the start.
     SimulationError
         Only with ``raise_on_failure``.
-    ControllerError, EventError
-        If a controller, force or event function raises, or returns another shape or numbers that
-        are not finite, at the start of the run; what it raised is the ``__cause__``.
+    EventError
+        If an event function raises, or does not return one finite number, at the start; what it
+        raised is the ``__cause__``.
     """
     options = locals()  # every other parameter is one
     for name in ("problem", "t_span", "x0"):

@@ -96,6 +96,11 @@ def joined_names(names: Iterable[str]) -> str:
     return f"{listed} and {more} more" if more > 0 else listed
 
 
+def counted(count: int, noun: str) -> str:
+    """``1 degree``, ``2 degrees``: a ``noun`` with a regular plural."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 class _Printable(logging.Filter):
     """Escapes the texts of log records, as :func:`printable` does."""
 
@@ -171,6 +176,12 @@ class InputError(SrmError, ValueError):
         if self.file is None:
             self.file = file
         return self
+
+
+def unwritable(path: str | os.PathLike[str], error: OSError) -> InputError:
+    """The error about a file or folder ``path`` that the system does not let be written."""
+    reason = error.strerror or error
+    return InputError(f"it cannot be written: {reason}", file=os.fspath(path), remedy=CHECK_WRITING)
 
 
 class naming:  # noqa: N801 - used as a function

@@ -20,9 +20,9 @@ from srm_mbs.assembly.assemble import Assembly, assemble
 from srm_mbs.assembly.position import ClosureProblem, close_positions, onto_singular_point
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
-from srm_mbs.errors import InputError, get_logger, safe_repr
+from srm_mbs.errors import InputError, counted, get_logger, safe_repr
 from srm_mbs.model.coordinates import coordinate_names, free_coordinates, set_position
-from srm_mbs.model.numbers import name_list, named_values
+from srm_mbs.model.numbers import name_list, named_values, positive_integer
 
 log = get_logger(__name__)
 
@@ -131,12 +131,7 @@ def assembly_modes(
         If the held joints leave the mechanism free to move, so that modes are not isolated, or for
         unknown joints or malformed values.
     """
-    if not isinstance(starts, Integral) or starts < 1:
-        raise InputError(
-            f"starts = {safe_repr(starts)} is not a positive whole number",
-            element="starts",
-            remedy="Give a positive number, for example 200",
-        )
+    starts = positive_integer(starts, "starts", "Give a positive number, for example 200")
     if not isinstance(seed, Integral) or seed < 0:
         raise InputError(
             f"seed = {safe_repr(seed)} is not a natural number",
@@ -213,8 +208,8 @@ def _check_isolated(
     labels = coordinate_names(mechanism)
     what = f"with {', '.join(held)} held" if held else "with no joint held"
     raise InputError(
-        f"{what} the mechanism can still move ({least.shape[1]} degrees of freedom): its closed "
-        "configurations are not isolated",
+        f"{what} the mechanism can still move ({counted(least.shape[1], 'degree')} of freedom): "
+        "its closed configurations are not isolated",
         element="hold",
         remedy=f"Hold more; free to move are {', '.join(labels[i] for i in moving)}",
     )

@@ -35,9 +35,9 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     nearest_singular,
     smallest_singular_value,
 )
-from srm_mbs.errors import AnalysisError, InputError, KnownKeys, get_logger, safe_repr
+from srm_mbs.errors import AnalysisError, InputError, KnownKeys, get_logger
 from srm_mbs.model.coordinates import free_coordinates, joint_coordinates
-from srm_mbs.model.numbers import name_list
+from srm_mbs.model.numbers import choice, name_list
 
 log = get_logger(__name__)
 
@@ -332,12 +332,7 @@ def equilibrium(
         If there is no equilibrium, or none was found; its ``q`` is the last configuration.
     """
     check_mechanism(mechanism)
-    if not isinstance(search, str) or search not in ("stable", "nearest"):
-        raise InputError(
-            f"search = {safe_repr(search)} is not known",
-            element="search",
-            remedy='Give "stable" or "nearest"',
-        )
+    choice(search, ("stable", "nearest"), "search")
     mechanism.refuse_drives("an equilibrium")
     held = name_list(hold, "hold")
     start = assemble(mechanism, q, hold=held)

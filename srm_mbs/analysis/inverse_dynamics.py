@@ -25,10 +25,11 @@ from srm_mbs.dynamics.constraints.reactions import Reactions, reactions_at
 from srm_mbs.dynamics.constraints.structure import structure_of
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, counted
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.model.lazy import cached_property
-from srm_mbs.simulation.options import numbers, positive
+from srm_mbs.model.numbers import positive_number
+from srm_mbs.simulation.options import numbers
 from srm_mbs.simulation.result import SimulationResult
 
 MOTION_TOLERANCE = 1e-6
@@ -173,7 +174,7 @@ def inverse_dynamics(
         the actuated joints cannot exert.
     """
     check_mechanism(mechanism)
-    tolerance = positive(tolerance, "tolerance")
+    tolerance = positive_number(tolerance, "tolerance")
     mechanism = mechanism.undriven  # the actuators replace the drives
     times, q, v, a = _motion(mechanism, motion, t)
     names = mechanism.joint_names if actuated is None else actuated
@@ -217,9 +218,9 @@ def inverse_dynamics(
     if residual.max(initial=0.0) > tolerance:
         worst = int(np.argmax(residual))
         raise InputError(
-            f"{', '.join(labels[j] for j in columns)} cannot drive this motion of {free} degrees "
-            f"of freedom: at t = {times[worst]:.6g} s {residual[worst]:.1e} of the largest force "
-            "is missing",
+            f"{', '.join(labels[j] for j in columns)} cannot drive this motion of "
+            f"{counted(free, 'degree')} of freedom: at t = {times[worst]:.6g} s "
+            f"{residual[worst]:.1e} of the largest force is missing",
             element="actuated",
             remedy="Name more joints",
         )

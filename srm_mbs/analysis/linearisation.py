@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
-from srm_mbs._typing import FloatArray, IndexArray
+from srm_mbs._typing import ComplexArray, FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import TangentChart, differences, tangent_basis
 from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
@@ -27,10 +27,10 @@ from srm_mbs.dynamics.forces import friction_sums, resolved_forces
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.singularities.local_analysis import TAU
-from srm_mbs.errors import InputError, get_logger, safe_repr
+from srm_mbs.errors import InputError, counted, get_logger, safe_repr
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.model.lazy import cached_property
-from srm_mbs.simulation.options import positive
+from srm_mbs.model.numbers import finite_number, positive_integer, positive_number
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 log = get_logger(__name__)
@@ -79,20 +79,20 @@ class Linearisation:
     chart: TangentChart = field(repr=False)
 
     @cached_property
-    def _eigen(self) -> tuple[Any, Any]:
+    def _eigen(self) -> tuple[FloatArray | ComplexArray, FloatArray | ComplexArray]:
         values, vectors = np.linalg.eig(self.A)
         order = np.lexsort((-values.imag, -values.real, np.round(np.abs(values.imag), 9)))
         return values[order], vectors[:, order]
 
     @property
-    def eigenvalues(self) -> Any:
-        """Eigenvalues of A (2 k,), complex, 1/s."""
+    def eigenvalues(self) -> FloatArray | ComplexArray:
+        """Eigenvalues of A (2 k,), 1/s; complex unless all of them are real."""
         return self._eigen[0]
 
     @cached_property
-    def modes(self) -> Any:
-        """Joint motions (nv, 2 k), complex, of each eigenvalue; the largest entry, in units, is
-        1."""
+    def modes(self) -> FloatArray | ComplexArray:
+        """Joint motions (nv, 2 k) of each eigenvalue, complex as they are; the largest entry, in
+        units, is 1."""
         k = len(self.coordinates)
         unit = self.chart.geometry.unit
         shapes = self.to_joints @ self._eigen[1][:k]
@@ -143,15 +143,10 @@ class Linearisation:
         Raises
         ------
         InputError
-            If there is no such mode, the mechanism cannot move that far, or ``frames`` is not
-            positive.
+            If there is no such mode, the mechanism cannot move that far, ``amplitude`` is no finite
+            number, or ``frames`` no positive integer.
         """
-        if not isinstance(frames, Integral) or frames < 1:
-            raise InputError(
-                f"frames = {safe_repr(frames)} is not a positive whole number",
-                element="frames",
-                remedy=f"Give a positive number, for example {FRAMES}",
-            )
+        frames = positive_integer(frames, "frames", f"Give a positive number, for example {FRAMES}")
         count = len(self.eigenvalues)
         if not isinstance(mode, Integral) or not -count <= mode < count:
             raise InputError(
@@ -159,6 +154,7 @@ class Linearisation:
                 element="mode",
                 remedy=f"Give 0 to {count - 1}",
             )
+        amplitude = finite_number(amplitude, "amplitude", "amplitude")
         mode = int(mode)
         turning = abs(float(self.eigenvalues[mode].imag))
         period = 2.0 * np.pi / turning if turning > 0.0 else 1.0
@@ -191,10 +187,10 @@ def _chosen(mechanism: Mechanism, basis: FloatArray, names: Iterable[str] | None
     )
     if smallest < INDEPENDENCE_TOLERANCE:
         raise InputError(
-            f"{len(chosen)} coordinates of these joints do not determine the {k} degrees of "
-            "freedom here",
+            f"{counted(len(chosen), 'coordinate')} of these joints cannot determine the "
+            f"{counted(k, 'degree')} of freedom here",
             element="coordinates",
-            remedy=f"Name joints with {k} independent coordinates, or none",
+            remedy=f"Name joints with {counted(k, 'independent coordinate')}, or none",
         )
     return chosen
 
@@ -237,7 +233,7 @@ def linearise(
     """
     check_mechanism(mechanism)
     mechanism.refuse_drives("a linearisation")
-    step = positive(step, "step")
+    step = positive_number(step, "step")
     if q is None:
         q, v = mechanism.q0, mechanism.v0 if v is None else v
     v = np.zeros(mechanism.model.nv) if v is None else v

@@ -30,7 +30,7 @@ from srm_mbs.assembly.position import ClosureProblem, polish
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.dynamics.constraints.wrenches import Placements
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
-from srm_mbs.dynamics.scaling import coordinate_units, is_angle
+from srm_mbs.dynamics.scaling import coordinate_units, is_angle, joint_track
 from srm_mbs.errors import InputError, KnownKeys
 from srm_mbs.formats.files import checked_path
 from srm_mbs.model.anchors import one_degree_joint
@@ -314,7 +314,9 @@ class _Analysis:
         self._unit = coordinate_units(mechanism, mechanism.q0, mechanism.v0).coordinate
         names = [n for n in mechanism.joint_names if mechanism.joint(n).nv == 1 and n != crank]
         rates = np.array([self.rates(row) for row in q])
-        self.joints: KnownKeys[FloatArray] = KnownKeys((name, self._track(name)) for name in names)
+        self.joints: KnownKeys[FloatArray] = KnownKeys(
+            (name, joint_track(mechanism, q, name)) for name in names
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             along = rates / rates[:, [mechanism.joint(crank).idx_v]]
         self._along = along
@@ -329,10 +331,6 @@ class _Analysis:
         self._rows.evaluate(self.mechanism.model, self._data, q)
         null: FloatArray = np.linalg.svd(self._rows.G * self._unit)[2][-1] * self._unit
         return null * (1.0 if null[self.mechanism.joint(self.crank).idx_v] >= 0.0 else -1.0)
-
-    def _track(self, name: str) -> FloatArray:
-        found = np.array([position_of(self.mechanism, row, name) for row in self.q])
-        return np.unwrap(found) if is_angle(self.mechanism.model, name) else found
 
     def report(self, dead: tuple[float, ...]) -> LinkageReport:
         """The report, with the positions of the crank beyond which it cannot move."""

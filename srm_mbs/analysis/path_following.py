@@ -20,7 +20,7 @@ from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import InputError, get_logger, safe_repr
 from srm_mbs.model.coordinates import position_of
-from srm_mbs.model.numbers import finite_array, named_values
+from srm_mbs.model.numbers import finite_array, named_values, positive_number
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 log = get_logger(__name__)
@@ -87,16 +87,8 @@ class FollowedPath:
         InputError
             If the duration is not positive.
         """
-        number = finite_array(duration, ())
-        if number is None or not number > 0.0:
-            raise InputError(
-                f"duration = {safe_repr(duration)} is not positive",
-                element="duration",
-                remedy="Give a positive number of seconds",
-            )
-        times = (
-            np.linspace(0.0, float(number), len(self.path)) if len(self.path) > 1 else np.zeros(1)
-        )
+        end = positive_number(duration, "duration", " of seconds")
+        times = np.linspace(0.0, end, len(self.path)) if len(self.path) > 1 else np.zeros(1)
         return JointMotion(self.mechanism, times, self.path)
 
 

@@ -79,8 +79,13 @@ def _free(mechanism: MechanismData, held: tuple[str, ...]) -> list[int]:
     return known[held]
 
 
+BEYOND_ROUNDING = 2.0
+"""Factor by which numbers of :class:`Bodies` are beyond a bound, wherever the kernel rounds them
+differently."""
+
+
 class Bodies(NamedTuple):
-    """How far the bodies of a mechanism are from doubts about them.
+    """How far the bodies of a mechanism are from doubts about them, as the kernel finds them.
 
     Attributes
     ----------

@@ -17,13 +17,13 @@ import typer
 from typer.models import ArgumentInfo, OptionInfo
 
 from srm_mbs.errors import (
-    CHECK_WRITING,
     FailedRunWarning,
     InputError,
     SrmError,
     SrmWarning,
     get_logger,
     printable,
+    unwritable,
 )
 
 log = get_logger(__name__)
@@ -212,10 +212,7 @@ def write_files(
             write(path)
         except (OSError, SrmError) as error:
             if isinstance(error, OSError):
-                reason = error.strerror or error
-                error = InputError(
-                    f"it cannot be written: {reason}", file=str(path), remedy=CHECK_WRITING
-                )
+                error = unwritable(path, error)
             say("error", f"{path}: {str(error).removeprefix(f'{path}: ')}")
             failed = True
         else:

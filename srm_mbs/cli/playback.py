@@ -152,12 +152,10 @@ def check_time(at: float | None, t_end: float, start: float = 0.0) -> None:
     InputError
         If it lies outside.
     """
-    if at is not None and not (start <= at <= t_end or t_end <= start):
-        raise InputError(
-            f"{at:g} s lies outside the run, from {start:g} to {t_end:g} s",
-            element="--at",
-            remedy="Give a time of the run",
-        )
+    from srm_mbs.integration.dense_output import checked_time
+
+    if at is not None and start < t_end:
+        checked_time(at, start, t_end, "--at")
 
 
 def check_overlays(

@@ -150,6 +150,8 @@ def _numbers(given: Any, size: int, scalar: bool = False) -> FloatArray | str:
         return safe_repr(given)
     if scalar and size == 1 and result.ndim == 0:
         result = result.reshape(1)
+    if result.ndim == 0:
+        return safe_repr(given)
     if result.shape != (size,):
         return f"an array of shape {result.shape}"
     if not np.isfinite(result).all():

@@ -1006,7 +1006,7 @@ class ForceKinematics:
         v: FloatArray,
         t: float,
         applied: FloatArray,
-        step: Mapping[Evaluator, BushingStep] = MappingProxyType({}),
+        step: Mapping[Evaluator, BushingStep],
     ) -> FloatArray:
         """As :meth:`generalised`, where ``applied`` act in place of the laws between links, and
         no springs on coordinates."""

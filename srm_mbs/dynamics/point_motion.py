@@ -94,7 +94,7 @@ def _rates(
     return (R @ velocity[..., None])[..., 0], (R @ acceleration[..., None])[..., 0]
 
 
-def given_point(mechanism: MechanismData, point: Any, element: str = "point") -> Anchor:
+def given_point(mechanism: MechanismData, point: Any, element: str) -> Anchor:
     """``point`` as an anchor: an anchor, or the name of a point that the mechanism has.
 
     Raises

@@ -18,7 +18,7 @@ from srm_mbs.assembly.assemble import consistent_start
 from srm_mbs.assembly.diagnosis import CORRECT_AXIS, inclined_axes
 from srm_mbs.assembly.implied_rows import without_implied_rows
 from srm_mbs.assembly.position import CONSTRAINT_TOLERANCE, limit_springs
-from srm_mbs.assembly.regular_start import Bodies, bodies_at_start
+from srm_mbs.assembly.regular_start import BEYOND_ROUNDING, bodies_at_start
 from srm_mbs.dynamics.constraints.reusable_analysis import ReusableAnalysis
 from srm_mbs.dynamics.constraints.structure import structure_of
 from srm_mbs.dynamics.mechanism import Mechanism
@@ -33,10 +33,9 @@ from srm_mbs.errors import (
 )
 from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.plausibility import (
-    LARGEST_GYRATION,
-    SMALLEST_GYRATION,
     doubtful_angles,
     doubtful_inertias,
+    doubtful_rotations,
 )
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
 from srm_mbs.formats.toml.parameters import Place
@@ -372,10 +371,6 @@ ROTOR_INERTIA = 1e-9
 less than tolerances show, and enough for accelerations to be above rounding."""
 
 
-CLEARLY = 2.0
-"""Factor by which what the kernel computes is beyond a bound, wherever it rounds differently."""
-
-
 def _with_rotors(mechanism: Mechanism) -> tuple[Mechanism, int | None]:
     """The mechanism with rotors on damped joints that move no inertia at the start, and a note; and
     a joint that moves none still, if there is one.
@@ -384,7 +379,7 @@ def _with_rotors(mechanism: Mechanism) -> tuple[Mechanism, int | None]:
     """
     model, source = mechanism.model, mechanism.source
     bodies = bodies_at_start(mechanism)
-    if bodies is not None and bodies.least_inertia > CLEARLY * ROTOR_INERTIA:
+    if bodies is not None and bodies.least_inertia > BEYOND_ROUNDING * ROTOR_INERTIA:
         return mechanism, None
     armature = np.array(model.armature)
     path = None if source is None else source.urdf_path
@@ -466,22 +461,22 @@ def _started(
     return started, joint
 
 
-def _are_plausible(bodies: Bodies | None) -> bool:
-    """Whether :func:`doubtful_inertias` has nothing to say, clearly."""
-    return bodies is not None and (
-        bodies.least_gyration > CLEARLY * SMALLEST_GYRATION
-        and CLEARLY * bodies.largest_gyration < LARGEST_GYRATION
-    )
+def _doubtful_angles(mechanism: Mechanism, reading: Reading) -> list[str]:
+    """Sentences about angles that may be in degrees."""
+    initial, terms = reading.description.initial, reading.file_terms
+    return [
+        *doubtful_angles(mechanism, "initial.q", initial.q, terms),
+        *doubtful_angles(mechanism, "initial.guess", initial.guess, terms),
+        *(() if reading.analysis is not None else doubtful_rotations(mechanism, reading.tree)),
+    ]
 
 
 def _with_doubts(mechanism: Mechanism, reading: Reading) -> Mechanism:
     """The mechanism with notes about values that look like those of other units, and about an axis
     that keeps a loop from moving; warnings say the same."""
-    initial, terms = reading.description.initial, reading.file_terms
     doubts = [
-        *doubtful_angles(mechanism, "initial.q", initial.q, terms),
-        *doubtful_angles(mechanism, "initial.guess", initial.guess, terms),
-        *(() if _are_plausible(bodies_at_start(mechanism)) else doubtful_inertias(mechanism)),
+        *_doubtful_angles(mechanism, reading),
+        *doubtful_inertias(mechanism),
     ]
     if mechanism.loops and mechanism.degrees_of_freedom == 0 and not mechanism.drives:
         inclined = inclined_axes(mechanism).values()
@@ -522,7 +517,9 @@ def assembled(reading: Reading) -> Mechanism:
     except AssemblyError as error:
         if reading.file_terms is not None:
             reading.file_terms.explain(error)
-        error.remedy += _advice(error)
+        error.remedy = ". ".join(
+            (error.remedy + _advice(error), *_doubtful_angles(mechanism, reading))
+        )
         if description.lock:
             locked = ", ".join(map(repr, description.lock))
             error.remedy = f"{error.remedy}. Locked, so that they cannot help: {locked}"

@@ -13,13 +13,13 @@ from xml.etree.ElementTree import Element
 
 import tomli_w
 
-from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, naming
+from srm_mbs.errors import InputError, get_logger, naming, unwritable
 from srm_mbs.formats.build import Reading, unassembled
 from srm_mbs.formats.files import checked_path, write_texts
 from srm_mbs.formats.load import Overrides, read
 from srm_mbs.formats.toml.parameters import given_parameters
 from srm_mbs.model.numbers import flag, name_list
-from srm_mbs.model.reach import Reach
+from srm_mbs.model.reach import Reach, folder_list
 
 log = get_logger(__name__)
 
@@ -64,7 +64,7 @@ def convert(
     target = _description_path(out)
     overrides = Overrides(
         cut=name_list(cut, "cut"),
-        mesh_dirs=tuple(mesh_dirs),
+        mesh_dirs=folder_list(mesh_dirs),
         allow_outside=allow_outside,
         keyframe=keyframe,
         massless=massless,
@@ -87,7 +87,7 @@ def _description_path(out: str | Path) -> Path:
 
 
 def write_description(
-    reading: Reading, out: str | Path, *, inputs: Sequence[str | Path] = (), force: bool = False
+    reading: Reading, out: str | Path, *, inputs: Sequence[str | Path] = (), force: bool
 ) -> tuple[Path, Path, tuple[str, ...]]:
     """Write what was read as a description, and its tree as a URDF beside it.
 
@@ -120,7 +120,9 @@ def write_description(
             )
         if target.exists() and not force:
             raise InputError(
-                "the file exists", file=str(target), remedy="Give another name, or --force"
+                "the file exists",
+                file=str(target),
+                remedy="Give another name, or overwrite it with force=True (--force)",
             )
     entries = deepcopy(dict(reading.entries)) | {"urdf": urdf.name}
     _move_tables(entries, Path(source.path), description)
@@ -128,11 +130,7 @@ def write_description(
     try:
         write_texts({urdf: written, description: tomli_w.dumps(entries)})
     except OSError as error:
-        raise InputError(
-            f"it cannot be written: {error.strerror}",
-            file=str(error.filename or out),
-            remedy=CHECK_WRITING,
-        ) from error
+        raise unwritable(error.filename or out, error) from error
     log.info("written: %s and %s", description, urdf)
     notes = mechanism.notes
     if elsewhere:

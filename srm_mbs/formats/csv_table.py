@@ -13,7 +13,7 @@ from typing import IO
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, known_names, naming
+from srm_mbs.errors import InputError, counted, known_names, naming
 from srm_mbs.formats.files import check_name, open_regular, shortened
 from srm_mbs.model.reach import Reach
 
@@ -26,6 +26,7 @@ CHUNK = 4 * 10**6
 """Bytes of a table that are read at once; no line is longer."""
 QUOTED_CHUNK = 10_000
 """Rows with quotes that are converted at once."""
+_SEPARATE = "Separate columns by commas, and write decimal points"
 GIVE_NUMBERS = "Give one finite number in every column"
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")
@@ -83,7 +84,7 @@ class CsvTable:
                     f"there is no column {name!r}" if missing else f"two columns {name!r}",
                     file=self.file,
                     element="first line",
-                    remedy=known_names(self.names),
+                    remedy=_SEPARATE if ";" in "".join(self.names) else known_names(self.names),
                 )
         wanted = [self.names.index(name) for name in names]
         wrong = [self.faults[k] for k in (-1, *wanted) if k in self.faults]
@@ -210,7 +211,8 @@ class _Reader:
     def row(self, cells: list[str], at: int) -> list[float]:
         width = len(self.names)
         if len(cells) != width:
-            self.faults.setdefault(-1, (at, f"{len(cells)} values, {width} columns"))
+            reason = f"{counted(len(cells), 'value')}, {counted(width, 'column')}"
+            self.faults.setdefault(-1, (at, reason))
             return [np.nan] * width
         out = []
         for k, cell in enumerate(cells):

@@ -118,7 +118,7 @@ def _read(text: str) -> dict[str, list[Any]]:
         raise _fault("", "it holds no keys", f"Give {', '.join(KEYS)}")
     for key in raw:
         if key not in KEYS:
-            raise _fault(shortened(str(key)), "this key is unknown", f"Known: {', '.join(KEYS)}")
+            raise _fault(shortened(str(key)), "this key is unknown", known_names(KEYS))
     lists: dict[str, list[Any]] = {}
     for key in KEYS:
         value = raw.get(key)

@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
-from numbers import Integral
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -36,8 +35,14 @@ from srm_mbs.formats.urdf.variants import OverridableTree
 from srm_mbs.formats.variants import VARYING, KnownLinkage
 from srm_mbs.model.copies import copied
 from srm_mbs.model.mechanism import Source, SourceTexts, variant_maker
-from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_array, name_list
-from srm_mbs.model.reach import Reach
+from srm_mbs.model.numbers import (
+    LARGEST_MAGNITUDE,
+    choice,
+    finite_array,
+    name_list,
+    positive_integer,
+)
+from srm_mbs.model.reach import Reach, folder_list
 
 log = get_logger(__name__)
 
@@ -104,17 +109,6 @@ def _gravity(value: Any) -> tuple[float, float, float]:
     return (x, y, z)
 
 
-def _checked_base(base: Any) -> str:
-    """``base`` as the name of a root joint."""
-    if not isinstance(base, str) or base not in ROOT_JOINTS:
-        raise InputError(
-            f"there is no base {safe_repr(base)}",
-            element="base",
-            remedy=f"Known: {', '.join(ROOT_JOINTS)}",
-        )
-    return base
-
-
 @lru_cache(maxsize=KEPT_NAMES)
 def _urdf_name(file: str) -> str:
     """Name of the URDF that a translation of ``file`` makes."""
@@ -140,7 +134,7 @@ def _translated(
             remedy="Give the name of a keyframe of an MJCF file",
         )
     cut = overrides.cut or tuple(description.cut)
-    base = None if overrides.base is None else _checked_base(overrides.base)
+    base = None if overrides.base is None else choice(overrides.base, ROOT_JOINTS, "base")
     tree = None if known is None else known.tree
     options = Options(cut, entries, reach, keyframe, base, description.planar, tree)
     translation = found.translate(model, options)
@@ -533,7 +527,7 @@ def load(
         gravity,
         base,
         name_list(cut, "cut"),
-        tuple(mesh_dirs),
+        folder_list(mesh_dirs),
         allow_outside,
         keyframe,
         massless,
@@ -608,10 +602,5 @@ def n_four_bar(n: int) -> Mechanism:
     InputError
         If n < 1 or n > 1000 (300 without the compiled kernel).
     """
-    if not isinstance(n, Integral) or n < 1:
-        raise InputError(
-            f"an N-four-bar needs n >= 1, not {safe_repr(n)}",
-            element="n",
-            remedy="Give a positive integer",
-        )
-    return assembled(_generated(int(n), Overrides()))
+    loops = positive_integer(n, "n", "Give the number of loops", " of loops")
+    return assembled(_generated(loops, Overrides()))

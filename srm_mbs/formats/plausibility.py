@@ -6,9 +6,11 @@ import math
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import pinocchio as pin
 
+from srm_mbs.assembly.regular_start import BEYOND_ROUNDING, bodies_at_start
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import (
     anchor_points,
@@ -21,8 +23,8 @@ from srm_mbs.dynamics.scaling import (
 from srm_mbs.formats.translation import FileTerms
 from srm_mbs.model.numbers import vector_elements
 
-LARGEST_START = 4.0 * math.pi
-"""Angle (rad) of a start above which it may be in degrees."""
+LARGEST_ANGLE = 4.0 * math.pi
+"""Angle (rad) of a start or of a frame above which it may be in degrees."""
 LARGEST_GYRATION = 10.0
 """Radius of gyration of a body, over the size of the mechanism, above which a unit is doubtful."""
 SMALLEST_GYRATION = 1e-3
@@ -35,15 +37,34 @@ def doubtful_angles(
     """Sentences about angles among ``values`` of ``element``, joint -> position, that may be in
     degrees; ``terms`` as of a :class:`~srm_mbs.formats.translation.Translation`."""
     for name, value in values.items():
-        single = isinstance(value, int | float) and abs(value) > LARGEST_START
+        single = isinstance(value, int | float) and abs(value) > LARGEST_ANGLE
         if single and name in mechanism.joint_names and is_angle(mechanism.model, name):
             given = None if terms is None else terms.written(name)
             key, unit, factor = given or (element, "rad", 1.0)
-            degrees = f", and {value:g} degrees are {math.radians(value):.6g} rad"
-            yield (
-                f"{key}: the angle {value / factor:g} of the joint {name!r} is more than two "
-                f"turns: angles are in {unit}{degrees if unit == 'rad' else ''}"
-            )
+            yield f"{key}: the angle {value / factor:g} of the joint {name!r} {_doubt(value, unit)}"
+
+
+def doubtful_rotations(mechanism: Mechanism, tree: Element) -> Iterator[str]:
+    """Sentences about frames of the URDF ``tree`` and of closures whose ``rpy`` may be in
+    degrees."""
+    placed = [
+        (f"{node.tag} {node.get('name')!r}", tuple(map(float, origin.get("rpy", "0").split())))
+        for node in tree
+        for origin in node.iter("origin")
+    ]
+    placed += [
+        (f"loop {loop.name!r}", anchor.rpy) for loop in mechanism.loops for anchor in loop.anchors
+    ]
+    for element, angles in placed:
+        largest = max(angles, key=abs, default=0.0)
+        if abs(largest) > LARGEST_ANGLE:
+            yield f"{element}: the angle {largest:g} of rpy {_doubt(largest, 'rad')}"
+
+
+def _doubt(angle: float, unit: str) -> str:
+    """Why an ``angle`` (rad) that is written in ``unit`` is doubtful."""
+    degrees = f", and {angle:g} degrees are {math.radians(angle):.6g} rad" * (unit == "rad")
+    return f"is more than two turns: angles are in {unit}{degrees}"
 
 
 def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:
@@ -53,6 +74,13 @@ def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:
     The size of a body is the largest distance of its joints, anchors and centre of mass from the
     origin of the joint that moves it.
     """
+    bodies = bodies_at_start(mechanism)
+    if (
+        bodies is not None
+        and bodies.least_gyration > BEYOND_ROUNDING * SMALLEST_GYRATION
+        and BEYOND_ROUNDING * bodies.largest_gyration < LARGEST_GYRATION
+    ):
+        return
     model = mechanism.model
     # Known from the analysis; 1 also where all points are one.
     scene = coordinate_units(mechanism, mechanism.q0, mechanism.v0).length

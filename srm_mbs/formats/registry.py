@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, known_names
 from srm_mbs.formats import gepetto
 from srm_mbs.formats.document import Document
 from srm_mbs.formats.files import shortened
@@ -101,13 +101,13 @@ def find_format(path: Path, document: Document) -> Format:
         return found
     tag = document.root_tag
     suffix = shortened(path.suffix)
-    what = (
-        f"a file with the root element <{shortened(tag)}>" if tag else f"a file of type {suffix!r}"
-    )
+    what = f"a file of type {suffix!r}" if document.text.strip() else "an empty file"
+    if tag:
+        what = f"a file with the root element <{shortened(tag)}>"
     raise InputError(
         f"{what} is not of a format that is read",
         file=str(path),
-        remedy=f"Known: {', '.join(known.name for known in FORMATS)}",
+        remedy=known_names(known.name for known in FORMATS),
     )
 
 

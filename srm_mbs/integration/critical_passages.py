@@ -53,6 +53,9 @@ ROUNDED_RESIDUAL = 1e-13
 DISTURBING = 1e-3
 """Residual that counts as zero, over rtol, up to which steps pass as if it were, unless they are
 to end beside the passage."""
+WIDE = 0.5 * SEARCH**2
+"""Residual (row units) from which the layer, of sqrt(2 |delta|) where H is 1, is as wide as that:
+steps resolve it."""
 LARGEST = 64
 """Coordinates of a mechanism whose passages are examined, at most: the search is dense algebra."""
 LAYER = 1.5
@@ -831,10 +834,15 @@ class CriticalPassages:
             placement="critical",
         )
 
+    def ended(self, t: float) -> None:
+        """The run ended at ``t`` (s): steps did not make the passages that were expected later."""
+        self.examined = [one for one in self.examined if one.resolved or one.time <= t]
+
     def message(self) -> str:
         """Sentences on the passages that the tolerance decided, or that could not be resolved."""
         by_tolerance = [abs(one.residual) for one in self.examined if not one.avoided]
-        missed = [one for one in self.examined if one.avoided and not one.resolved]
+        unresolved = [one for one in self.examined if one.avoided and not one.resolved]
+        missed = [one for one in unresolved if abs(one.residual) < WIDE]
         out = ""
         if by_tolerance:
             out += (

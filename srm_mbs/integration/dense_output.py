@@ -35,6 +35,7 @@ from srm_mbs.integration.methods.branch_nodes import BRANCH_SIGMA
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.model.lazy import cached_property
+from srm_mbs.model.numbers import finite_number
 
 TIME_TOLERANCE = 1e-12
 """Largest distance of an output time beyond the ends of a run, over the time, for rounding."""
@@ -94,6 +95,24 @@ def check_within(t: FloatArray, start: float, end: float) -> None:
             element="t",
             remedy="Give times of the run",
         )
+
+
+def checked_time(t: Any, start: float, end: float, element: str) -> float:
+    """``t``, one time (s) of a run from ``start`` to ``end`` (s).
+
+    Raises
+    ------
+    InputError
+        About ``element``, if it is anything else.
+    """
+    number = finite_number(t, "t", element, "Give a time of the run")
+    if not start <= number <= end:
+        raise InputError(
+            f"{number:g} s lies outside the run, from {start:g} to {end:g} s",
+            element=element,
+            remedy="Give a time of the run",
+        )
+    return number
 
 
 def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> BoolArray:

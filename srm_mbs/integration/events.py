@@ -249,6 +249,12 @@ def _event_function(
         )
     label = place if name == "<lambda>" else repr(name)
     action = getattr(event, "action", None)
+    if not (action is None or callable(action)):
+        raise InputError(
+            f"action = {safe_repr(action)} cannot be called",
+            element=place,
+            remedy="Give a function of (t, q, v)",
+        )
     return EventFunction(label, adapt(event), occurrences, _number(direction), action)
 
 

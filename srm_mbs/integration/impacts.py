@@ -11,7 +11,7 @@ from srm_mbs._kernel.workspace import LARGE, take_idle
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
-from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.errors import InputError, counted, safe_repr
 from srm_mbs.integration.kernel.backend import backend
 from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
 from srm_mbs.model.mechanism import per_model
@@ -86,7 +86,7 @@ def impact(
             remedy="Give 0 (nothing springs back) to 1 (all of it)",
         )
     q, v = checked_start(mechanism.model, q, v, STATE_ARGUMENTS)
-    remedy = f"Give {len(v)} numbers"
+    remedy = f"Give {counted(len(v), 'number')}"
     n = finite_array(normal)
     if n is None:
         raise InputError(

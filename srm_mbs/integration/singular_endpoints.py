@@ -55,7 +55,10 @@ BLOCK_MOTION = 0.2
 BLOCK_TIME = 1.0
 """Longest block, in characteristic times of the mechanism."""
 DEPARTURE_BLOCKS = 12
-"""Blocks within which a motion must depart from its singular start."""
+"""Blocks of full length within which a motion must depart from its singular start."""
+SMALLEST_BLOCK = 1.0 / 32.0
+"""Part of its full length to which a block of a departure is shortened, at most, where the
+multipliers vary more than its nodes resolve: forces may have shorter times than the motion."""
 DEPARTED_SIGMA = 0.02
 """sigma from which a motion has departed from a singular configuration."""
 MAX_ITERATIONS = 8
@@ -344,8 +347,11 @@ class BranchMotion:
         speed, acceleration = np.abs(rate / unit).reshape(2, -1).max(axis=1).tolist()
         return bool(longest * (speed + 0.5 * longest * acceleration) < DEPARTED_SIGMA)
 
-    def departure(self, t: float, start: Point, t_end: float) -> MultiplierHistory:
-        """The multipliers of the motion from ``start`` at ``t`` until it has departed.
+    def departure(
+        self, t: float, start: Point, t_end: float, memory: IntegratorState
+    ) -> MultiplierHistory:
+        """The multipliers of the motion from ``start`` at ``t`` until it has departed; ``memory``
+        is that of the start.
 
         Raises
         ------
@@ -356,12 +362,14 @@ class BranchMotion:
         """
         longest = BLOCK_TIME / self.analysis.rate_unit
         times, points = [t], [start]
-        for _ in range(DEPARTURE_BLOCKS):
-            span = min(self._block_time(points[-1].rate, longest), t_end - times[-1])
-            block_times = np.linspace(times[-1], times[-1] + span, BLOCK_STEPS + 1)
-            block = self.block(points[-1], block_times, LARGEST_ZONE_SIGMA)
-            if block is None:
+        covered, part = 0.0, 1.0
+        while covered < DEPARTURE_BLOCKS:
+            whole = self._block_time(points[-1].rate, longest)
+            found = self._departing_block(times[-1], points[-1], whole, part, t_end, memory)
+            if found is None:
                 break
+            block_times, block, part = found
+            covered += part
             times += block_times[1:].tolist()
             points += block[1:]
             if points[-1].sigma >= DEPARTED_SIGMA or times[-1] >= t_end * (1.0 - 1e-12):
@@ -374,6 +382,34 @@ class BranchMotion:
                 remedy="Start with more speed, or further away",
             )
         return _known(np.array(times), points, times[-1])
+
+    def _departing_block(
+        self,
+        t: float,
+        start: Point,
+        whole: float,
+        part: float,
+        t_end: float,
+        memory: IntegratorState,
+    ) -> tuple[FloatArray, list[Point], float] | None:
+        """A block from ``t`` over ``part`` of the time ``whole`` (s), or over less where its nodes
+        do not resolve the multipliers: its times, its points, and the part that it covers; None if
+        there is none.  It is the first that is accurate enough, or else the best."""
+        best, found = np.inf, None
+        while part >= SMALLEST_BLOCK:
+            span = min(part * whole, t_end - t)
+            times = np.linspace(t, t + span, BLOCK_STEPS + 1)
+            block = self.block(start, times, LARGEST_ZONE_SIGMA)
+            if block is not None:
+                error = _interpolation_error(
+                    _known(times, block, t + span), memory, self.norm, span
+                )
+                if found is None or error < best:
+                    best, found = error, (times, block, part)
+                if error < ARRIVAL_ERROR:
+                    break
+            part *= 0.5
+        return found
 
     def arrival(self, t: float, start: Point, end: float, blocks: int) -> MultiplierHistory | None:
         """The multipliers of the motion from ``start`` at ``t`` to ``end`` (s) by ``blocks`` blocks
@@ -628,7 +664,8 @@ def start(
         history, memory.lingering = replace(history, away=away), away is not None
     elif begins or memory.sigma < LARGEST_ZONE_SIGMA:
         try:
-            history = motion.departure(t, Point(state, rate, multiplier, memory.sigma), t_end)
+            here = Point(state, rate, multiplier, memory.sigma)
+            history = motion.departure(t, here, t_end, memory)
         except InputError:
             if begins:
                 raise

@@ -76,11 +76,15 @@ TURNED_BACK_COSINE = 0.9
 back or passed by."""
 TOUCHING_VALUE = 1e-6
 """Part of the values around below which such a motion touched the singular configuration."""
+UNTOUCHED_VALUE = 2.0 * TOUCHING_VALUE
+"""The same part from which a motion that turned back certainly did not."""
 VANISHING_TOGETHER = 2.0
 """Singular values up to this multiple of the smallest vanish with it."""
 RECORDED_DEPTH = 0.75
 """Largest of the lowest sigmas between recorded samples, over those at the sides, of a minimum that
 is examined: sigma differs from the singular values by some per cent."""
+BESIDE_TURN = np.array([0.5, 0.8, 1.0, 1.25, 2.0])
+"""Times at which a crossing beside a turn is looked for, over the one expected."""
 DIP_WIDTHS = (1, 3)
 """Recorded intervals on either side of a minimum in which it is looked for, one after the other."""
 MAX_REFINEMENTS = 12
@@ -99,6 +103,8 @@ SIGNED_DECREASE = 0.5
 """Value over the smallest one so far from which on it has no sign that would change at a zero."""
 VELOCITY_VALUE = 0.05
 """Part of the values around at which the velocity is taken before and after a crossing."""
+REVERSAL_STEPS = 2
+"""Steps of Newton's iteration for the time at which a motion turns back."""
 REVERSAL_SIGMA = 0.02
 """sigma below which a motion that turns back may have met a bifurcation."""
 UNDECIDED_DISTANCE = 3e-6
@@ -142,13 +148,18 @@ class ConstraintMonitor:
         self._tolerance = max(tolerance, ROUNDED_RESIDUAL)
         self.geometry = analysis.geometry(analysis.q0)
         self.rank = analysis.rank
-        self._analysis = analysis
-        self._dense = dense
+        self.analysis = analysis
+        self.dense = dense
         self._values = _singular_values(self.geometry.mechanism)
+        self._critical: dict[float, CriticalConfiguration | None] = {}
 
     def states(self, t: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """(q, v) at the times t (k,)."""
-        return [self._analysis.split(state) for state in self._dense(t)]
+        return [self.analysis.split(state) for state in self.dense(t)]
+
+    def configurations(self, t: FloatArray) -> FloatArray:
+        """q (k, nq) at the times t (k,)."""
+        return self.dense(t)[:, : self.geometry.model.nq]
 
     def place(self, t: float) -> FloatArray:
         """Configuration at t, as the geometry takes it."""
@@ -158,13 +169,18 @@ class ConstraintMonitor:
         """Last structural singular value of the normalised G at the times t (k,)."""
         if not len(t):
             return np.zeros(0)
-        q = self._dense(t)[:, : self.geometry.model.nq]
-        observables = self._dense.observables
+        q = self.configurations(t)
+        observables = self.dense.observables
         return observables.smallest_values(self.geometry, self._values, self.rank, t, q)
 
     def normalised(self, t: FloatArray) -> FloatArray:
         """The normalised G (k, rows, n) at the times t (k,)."""
         return self.geometry.normalised_rows(self._jacobians(t))
+
+    def separated(self, t: FloatArray, q: FloatArray) -> FloatArray:
+        """G (k, rows, n), of which :meth:`smallest` gives singular values, at the times t (k,) and
+        the configurations q (k, nq)."""
+        return self.geometry.separated_rows(self.dense.observables.jacobians(t, q))
 
     def near_null_spaces(self, G: FloatArray, active: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Null spaces of the ``active`` rows G (k, n) of the normalised ones that vanish at a
@@ -172,18 +188,19 @@ class ConstraintMonitor:
         return self._values.of_rows(active).near_null_spaces(G, self.rank)
 
     def _jacobians(self, t: FloatArray) -> FloatArray:
-        q = self._dense(t)[:, : self.geometry.model.nq]
-        return self._dense.observables.jacobians(t, q)
+        return self.dense.observables.jacobians(t, self.configurations(t))
 
     def critical(self, t: float) -> CriticalConfiguration | None:
         """The critical configuration next to the motion at t (s); None if there is none."""
-        return critical_configuration(
-            self.geometry,
-            self.rank,
-            self.place(t),
-            CROSSING_SEARCH,
-            jacobians=self._jacobians_at,
-        )
+        if t not in self._critical:
+            self._critical[t] = critical_configuration(
+                self.geometry,
+                self.rank,
+                self.place(t),
+                CROSSING_SEARCH,
+                jacobians=self._jacobians_at,
+            )
+        return self._critical[t]
 
     def is_regular(self, t: float, around: Sequence[float]) -> bool:
         """Whether the search for a critical configuration next to the motion at t (s) leaves its
@@ -201,7 +218,7 @@ class ConstraintMonitor:
         """As of the geometry, in one call of the observables."""
         nq = self.geometry.model.nq
         t = places[:, nq] if self.geometry.drives else np.zeros(len(places))
-        unscaled = self._dense.observables.jacobians(t, places[:, :nq])
+        unscaled = self.dense.observables.jacobians(t, places[:, :nq])
         return unscaled * (self.geometry.unit / self.geometry.row_unit[:, None])
 
     def counted_singular(self, t: float) -> FloatArray | None:
@@ -603,6 +620,93 @@ def _dips_in(
     return place[samples], own[k[chosen]]
 
 
+def _reversals(
+    monitor: ConstraintMonitor, steps: StepData, first: IndexArray, last: IndexArray
+) -> tuple[IndexArray, FloatArray, FloatArray]:
+    """In which of the ranges of steps from ``first`` to ``last`` (n,) all rates change their sign,
+    once: their indices (k,), and when (k,) s and where (k, nq)."""
+    split, unit = monitor.analysis.split, monitor.geometry.coordinate_unit
+    rates = split(steps.states)[1] / unit
+    reverses = np.flatnonzero((rates[:-1] * rates[1:]).sum(axis=1) < 0.0)
+    place = np.searchsorted(reverses, first)
+    once = np.flatnonzero(np.searchsorted(reverses, last, side="right") == place + 1)
+    step = reverses[place[once]]
+    change = rates[step + 1] - rates[step]
+    size = (change**2).sum(axis=1)
+    before, after = ((rates[end] * change).sum(axis=1) for end in (step, step + 1))
+    both = (rates[step] ** 2 + rates[step + 1] ** 2).sum(axis=1)
+    straight = size * both - before**2 - after**2 < (RESTING_SPEED * size) ** 2
+    step, change, before, size = (values[straight] for values in (step, change, before, size))
+    start, end = steps.times[step], steps.times[step + 1]
+    t = start - before / size * (end - start)
+    for _ in range(REVERSAL_STEPS):
+        _, v = split(monitor.dense(t))
+        t = np.clip(t - (v / unit * change).sum(axis=1) / size * (end - start), start, end)
+    return once[straight], t, monitor.configurations(t)
+
+
+@dataclass(frozen=True)
+class _Turn:
+    """Where a motion turned back next to a singular configuration, between two ends of steps.
+
+    Attributes
+    ----------
+    times
+        Of the one end, of the turn and of the other end (s).
+    values
+        The smallest singular value there, with the sign of the part of G that would lose rank:
+        positive at the turn.
+    """
+
+    times: tuple[float, float, float]
+    values: tuple[float, float, float]
+
+    @property
+    def beyond(self) -> bool:
+        """Whether the motion turned back beyond the singular configuration, not before it."""
+        return self.values[0] < 0.0
+
+
+def _turns(
+    monitor: ConstraintMonitor, scheme: ButcherTableau, steps: StepData, recorded: RecordedDips
+) -> dict[int, _Turn]:
+    """The turns at those of the ``recorded`` minima, by their indices, where all rates change their
+    sign and the motion certainly did not touch the singular configuration."""
+    if monitor.geometry.drives or np.logical_or.reduce(steps.stiff):
+        return {}
+    dips, tops = np.array(recorded[1]), np.array(recorded[2])
+    columns = scheme.member(False).distinct
+    stages = len(columns)
+    first, last = np.maximum(dips[:, 0] - 1, 0) // stages, (dips[:, 2] - 1) // stages
+    # Nothing is read beyond an event that ends the run.
+    alone = steps.times[last + 1] <= steps.end
+    alone[1:] &= dips[:-1, 1] < first[1:] * stages
+    alone[:-1] &= dips[1:, 1] > (last[:-1] + 1) * stages
+    own = np.flatnonzero(alone)
+    found, t, q = _reversals(monitor, steps, first[own], last[own])
+    if not len(found):
+        return {}
+    found = own[found]
+    first, last, top = first[found], last[found], np.maximum(tops[found] - 1, 0)
+    times = np.array((steps.times[first], t, steps.times[last + 1]))
+    q_first, q_last = (monitor.analysis.split(steps.states[end])[0] for end in (first, last + 1))
+    G = monitor.separated(times.ravel(), np.concatenate((q_first, q, q_last)))
+    G = G.reshape(3, len(found), *G.shape[1:])
+    left, sizes, right = np.linalg.svd(G[1])
+    k = monitor.rank - 1
+    values = np.einsum("ni,snij,nj->sn", left[:, :, k], G, right[:, k])
+    before, value, after = np.abs(values)
+    # The largest value of the window follows from the recorded sigmas.
+    untouched = UNTOUCHED_VALUE * steps.sigmas[top // stages, columns[top % stages]]
+    certain = (sizes[:, :k].min(axis=1, initial=np.inf) > VANISHING_TOGETHER * value) & (
+        values[0] * values[2] > 0.0
+    )
+    for side, recorded_side in ((before, steps.sigmas[first, 0]), (after, steps.sigmas[last, -1])):
+        certain &= value * recorded_side > untouched * side
+    pairs = zip(found.tolist(), certain.tolist(), zip(*times.tolist()), zip(*values.tolist()))
+    return {i: _Turn(own_times, own) for i, yes, own_times, own in pairs if yes}
+
+
 def _times_around(
     t: FloatArray, first: int, k: int, last: int, width: int, count: int
 ) -> FloatArray:
@@ -764,7 +868,13 @@ def find_crossings(
     searches = []
     if recorded is not None:
         t, dips, tops = recorded
-        searches = [_crossings_at(monitor, steps, t, *one) for one in zip(dips, tops)]
+        turns = _turns(monitor, scheme, steps, recorded)
+        for i, (dip, top) in enumerate(zip(dips, tops)):
+            turn = turns.get(i)
+            if turn is None:
+                searches.append(_crossings_at(monitor, steps, t, dip, top))
+            elif turn.beyond:
+                searches.append(_crossings_beside(monitor, steps, turn, t[[top]]))
     found: dict[float, Crossing] = {}
     for crossings in (*monitor.together(searches), _crossings_along_curves(monitor, steps)):
         for crossing in crossings:
@@ -810,6 +920,30 @@ def _crossings_at(
     found = []
     for minimum in minima:
         crossing = yield from _crossing_at(monitor, steps, minimum, scale, times, values)
+        if crossing is not None:
+            found.append(crossing)
+    return found
+
+
+def _crossings_beside(
+    monitor: ConstraintMonitor, steps: StepData, turn: _Turn, top: FloatArray
+) -> Search[list[Crossing]]:
+    """The two crossings next to a ``turn`` beyond a singular configuration.
+
+    ``top`` (1,): when sigma of the window is largest (s).
+    """
+    (before, rest, after), (_, value, _) = turn.times, turn.values
+    scale = float((yield top)[0])
+    found = []
+    for side, size in ((before, turn.values[0]), (after, turn.values[2])):
+        # Next to the turn values are parabolic in time.
+        part = math.sqrt(value / (value - size)) * BESIDE_TURN
+        times = np.sort(np.append(rest + (side - rest) * np.append(0.0, part[part < 1.0]), side))
+        values = yield times
+        k = 1 + int(values[1:-1].argmin())
+        crossing = yield from _crossing_at(
+            monitor, steps, (0, k, len(times) - 1), scale, times, values
+        )
         if crossing is not None:
             found.append(crossing)
     return found

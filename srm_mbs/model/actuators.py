@@ -21,6 +21,7 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.anchors import one_degree_joint, turn_counting_joint
+from srm_mbs.model.copies import short_repr
 from srm_mbs.model.numbers import finite_array, named_values, plain
 
 ActuatorType = Literal["motor", "position", "velocity"]
@@ -28,7 +29,7 @@ ACTUATOR_TYPES: tuple[str, ...] = get_args(ActuatorType)
 INSTEAD = "Name a joint with one degree of freedom"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Actuator:
     """A motor or servo on a joint with one degree of freedom, as MuJoCo has them.
 
@@ -81,6 +82,8 @@ class Actuator:
     reference: float = 0.0
     control_range: Sequence[float] | None = field(default=None, metadata={"count": 2})
     force_range: Sequence[float] | None = field(default=None, metadata={"count": 2})
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__

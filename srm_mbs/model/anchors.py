@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs.errors import InputError, joined_names, known_names, safe_repr
-from srm_mbs.model.copies import copied
+from srm_mbs.model.copies import copied, short_repr
 from srm_mbs.model.numbers import vector
 
 _UNTURNED, _IDENTITY = np.eye(3), np.eye(4)
@@ -20,7 +20,7 @@ WORLD = "world"
 _GIVE_ANCHOR = 'Give for example srm.Anchor("rod", xyz=(1.0, 0.0, 0.0))'
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Anchor:
     """A frame fixed on a body, at which a closure, force or drive acts.
 
@@ -46,6 +46,8 @@ class Anchor:
     frame: str | Sequence[float] | None = None
     xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if self.link is not None and isinstance(self.frame, tuple | list | np.ndarray):

@@ -31,9 +31,9 @@ import pinocchio as pin
 
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray, IndexArray
-from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
-from srm_mbs.model.copies import copied
+from srm_mbs.model.copies import copied, short_repr
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import (
     checked_name,
@@ -315,13 +315,15 @@ def _text(value: Any) -> str:
 
 
 def _listed(value: Any) -> tuple[Any, ...]:
+    if isinstance(value, str):
+        return (value,)
     try:
         return tuple(value)
     except Exception:  # objects may raise anything
         return ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LoopClosure:
     """One loop closure: between anchors ``a`` and ``b``, or (``coupling``) between joints.
 
@@ -384,6 +386,8 @@ class LoopClosure:
     arguments: tuple[float, ...] | None = _key("arguments", '"arguments = [...]"')
     without: tuple[str, ...] = ()
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         given = self.type
         if isinstance(given, ClosureType) and CLOSURE_TYPES.get(given.name) is given:
@@ -397,7 +401,7 @@ class LoopClosure:
         if not (known or isinstance(self.type, ClosureType)):
             raise self._fault(
                 f"there is no closure type {safe_repr(self.type)}",
-                f"Known: {', '.join(CLOSURE_TYPES)}",
+                known_names(CLOSURE_TYPES),
             )
         kind = self.kind
         if not known:
@@ -429,7 +433,7 @@ class LoopClosure:
                 raise self._fault(
                     f"the closure type {safe_repr(kind.name)} needs or takes {safe_repr(key)}, "
                     "which closures do not have",
-                    f"Known: {', '.join(keys)}",
+                    known_names(keys),
                 )
 
     def between(self, a: Anchor, b: Anchor) -> LoopClosure:
@@ -441,19 +445,19 @@ class LoopClosure:
     @property
     def _element(self) -> str:
         """Its name in messages."""
-        return f"loop {safe_repr(self.name)}"
+        return f"loop {safe_repr(self.name or self.type_name)}"
 
     def _fault(self, problem: str, remedy: str) -> InputError:
         return InputError(problem, element=self._element, remedy=remedy)
 
     def _take_without(self) -> None:
-        labels = (self.without,) if isinstance(self.without, str) else _listed(self.without)
+        labels = _listed(self.without)
         known = self._of_type().labels if labels else ()
         for label in labels:
             if label not in known:
                 raise self._fault(
                     f"a {self.kind.name} closure has no row {safe_repr(label)}",
-                    f"Known: {', '.join(known)}",
+                    known_names(known),
                 )
         if labels and set(labels) == set(known):
             raise self._fault("all its rows are left out", "Remove the closure")
@@ -471,7 +475,7 @@ class LoopClosure:
         object.__setattr__(self, "length", length)
 
     def _take_joints(self, given: Sequence[str]) -> None:
-        joints = (given,) if isinstance(given, str) else _listed(given)
+        joints = _listed(given)
         if not joints or not all(isinstance(name, str) for name in joints):
             raise self._fault(
                 f"joints = {safe_repr(given)} is not a list of names",

@@ -19,6 +19,7 @@ from srm_mbs._kernel.workspace import workspace
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
 from srm_mbs.model.closures import LoopClosure
+from srm_mbs.model.copies import short_repr
 from srm_mbs.model.laws import Curve, Law, Polynomial, Sine, Table, check_law, curve_of
 from srm_mbs.model.numbers import checked_name, unit_vector
 
@@ -29,7 +30,7 @@ NOMINAL_LENGTH = 1e-9
 """Length (m) of the closure of a driven distance, which the rows of the drive subtract again."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Drive:
     """A prescribed motion of a joint, or of a point relative to another.
 
@@ -68,6 +69,8 @@ class Drive:
     distance: bool = False
     absolute: bool = False
     name: str = ""
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         places = name_places(self._element, self.a, self.b)

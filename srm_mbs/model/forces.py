@@ -21,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.errors import InputError, counted, safe_repr
 from srm_mbs.model.anchors import (
     Anchor,
     check_apart,
@@ -299,8 +299,8 @@ class JointTorque(ForceElement):
         count = moving_joint(model, self.joint, self._element).nv
         if np.size(self.torque) != count:  # type: ignore[arg-type]
             raise self._fault(
-                f"torque = {safe_repr(self.torque)} does not fit the {count} degrees of freedom of "
-                f"joint {self.joint!r}",
+                f"torque = {safe_repr(self.torque)} does not fit the {counted(count, 'degree')} of "
+                f"freedom of joint {self.joint!r}",
                 "Give one number" if count == 1 else f"Give a list of {count} numbers",
             )
 

@@ -49,18 +49,28 @@ class Curve:
     def __call__(self, t: float) -> tuple[float, float, float]:
         """s, s' and s'' at t (s)."""
         i = max(bisect_right(self.breaks, t) - 1, 0)
-        x = t - self.breaks[i]
-        value = rate = half = 0.0
-        for c in reversed(self.pieces[i]):
+        return self._values(t, t - self.breaks[i], self.pieces[i], math)
+
+    def at(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The same (n,) at the times t (n,) s."""
+        breaks = np.array(self.breaks)
+        i = np.maximum(np.searchsorted(breaks, t, side="right") - 1, 0)
+        return self._values(t, t - breaks[i], np.array(self.pieces)[i].T, np)
+
+    def _values(self, t: Any, x: Any, piece: Any, functions: Any) -> tuple[Any, Any, Any]:
+        """s, s' and s'' at t, which is ``x`` after the begin of the ``piece``; ``functions``: the
+        module of sine and cosine."""
+        value = rate = half = 0.0 * x
+        for c in reversed(piece):
             half = half * x + rate
             rate = rate * x + value
             value = value * x + c
         bend = 2.0 * half
         for amplitude, omega, phase in self.sines:
-            angle = omega * t + phase
-            value += amplitude * math.sin(angle)
-            rate += amplitude * omega * math.cos(angle)
-            bend -= amplitude * omega * omega * math.sin(angle)
+            sine, cosine = functions.sin(omega * t + phase), functions.cos(omega * t + phase)
+            value = value + amplitude * sine
+            rate = rate + amplitude * omega * cosine
+            bend = bend - amplitude * omega * omega * sine
         return value, rate, bend
 
     def piece(self, t: float) -> Curve:

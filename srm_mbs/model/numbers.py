@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.errors import InputError, known_names, safe_repr
 
 LARGEST_MAGNITUDE = 1e30
 """Largest magnitude of a number in a file, in SI units: the squares of larger ones may overflow in
@@ -116,7 +117,7 @@ def choice(value: Any, known: Iterable[str], name: str) -> str:
     raise InputError(
         f"there is no {name} {safe_repr(value)}",
         element=name,
-        remedy=f"Known: {', '.join(map(repr, words))}",
+        remedy=known_names(words),
     )
 
 
@@ -202,6 +203,48 @@ def finite_number(
             remedy=remedy,
         )
     return float(array)
+
+
+def positive_number(
+    value: Any, name: str, unit: str = "", remedy: str = "Give a positive number"
+) -> float:
+    """``value``, the argument ``name``, as a positive finite float; messages say its ``unit``, such
+    as ``" of seconds"``.
+
+    Raises
+    ------
+    InputError
+        With that ``remedy``, if it is anything else.
+    """
+    try:
+        number = float(value)
+    except Exception:  # objects may raise anything
+        number = math.nan
+    if not (math.isfinite(number) and number > 0.0):
+        raise InputError(
+            f"{name} = {safe_repr(value)} is not a positive number{unit}",
+            element=name,
+            remedy=remedy,
+        )
+    return number
+
+
+def positive_integer(value: Any, name: str, remedy: str, unit: str = "") -> int:
+    """``value``, the argument ``name``, as an integer of at least 1; ``unit`` as of
+    :func:`positive_number`.
+
+    Raises
+    ------
+    InputError
+        With that ``remedy``, if it is anything else, True included.
+    """
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+        raise InputError(
+            f"{name} = {safe_repr(value)} is not a positive whole number{unit}",
+            element=name,
+            remedy=remedy,
+        )
+    return int(value)
 
 
 def _is_finite_float(value: Any) -> bool:

@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import pinocchio as pin
@@ -221,11 +222,29 @@ def _package_of(folder: Path) -> tuple[Path, ...]:
     return (folder.parent,) if usual else ()
 
 
-def _given_folders(folders: Iterable[str | os.PathLike[str]]) -> tuple[Path, ...]:
-    if isinstance(folders, str | os.PathLike):
-        folders = (folders,)
+def folder_list(given: Any) -> tuple[Any, ...]:
+    """``given``, one folder or several, as a tuple.
+
+    Raises
+    ------
+    InputError
+        If it is anything else.
+    """
+    if isinstance(given, str | os.PathLike):
+        return (given,)
+    try:
+        return tuple(given)
+    except TypeError:
+        raise InputError(
+            f"mesh_dirs = {safe_repr(given)} is not a list of folders",
+            element="mesh_dirs",
+            remedy="Give a list of folders",
+        ) from None
+
+
+def _given_folders(folders: Any) -> tuple[Path, ...]:
     found = []
-    for folder in folders:
+    for folder in folder_list(folders):
         if not isinstance(folder, str | os.PathLike) or not os.path.isdir(folder):
             raise InputError(
                 f"there is no folder {str(folder)!r}",

@@ -105,7 +105,7 @@ def _has_inertia(body: pin.Inertia) -> bool:
 def undetermined_joint(
     model: pin.Model,
     q: FloatArray,
-    file: str | None = None,
+    file: str | None,
     least: float = ARTICULATED_INERTIA_TOLERANCE,
 ) -> int | None:
     """A joint with a direction in which it moves no inertia at q (nq,); None if there is none.

@@ -58,8 +58,8 @@ _COMPONENTS = {
 def write_csv(
     solution: SimulationResult,
     path: str | Path,
-    points: Sequence[Anchor | str] = (),
-    reactions: bool = False,
+    points: Sequence[Anchor | str],
+    reactions: bool,
 ) -> None:
     """Write ``solution`` at its times ``solution.t`` to ``path``; see the module's text.
 

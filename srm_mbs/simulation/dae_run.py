@@ -34,6 +34,7 @@ from srm_mbs.simulation.runner import (
     failed_start,
     finished,
     integrate_steps,
+    raise_at_first_call,
     settings,
     statistics,
 )
@@ -124,6 +125,8 @@ def run_dae(
         For invalid input, before any stepping.
     SimulationError
         Only with ``raise_on_failure``.
+    EventError
+        If an event function fails where it is called first.
     """
     if not isinstance(problem, SemiExplicitDAE):
         raise InputError(
@@ -145,6 +148,7 @@ def run_dae(
         prepared = prepare_events(options.events, lambda event: event)
         watch = EventWatch(method.scheme, prepared, state.size)
     record, wrappers, first_sweeps = _integrate(system, options, norm, state, watch)
+    raise_at_first_call(record.error, t0)
     turned = suspected(wrappers)
     if first_sweeps:
         _add_sweep_failure(system, options, record, first_sweeps, turned)

@@ -78,8 +78,11 @@ class IncrementalRun(ABC):
     def state(self) -> FloatArray:
         """Current state (nq + nv,), a copy."""
 
-    def begin(self, t: float, state: FloatArray, force: FloatArray, span: float) -> None:
-        """Start from ``state`` at ``t`` (s), under ``force`` (nv,), for steps of ``span`` (s).
+    def begin(
+        self, t: float, state: FloatArray, force: FloatArray, span: float, smooth_until: float
+    ) -> None:
+        """Start from ``state`` at ``t`` (s), under ``force`` (nv,), for steps of ``span`` (s); the
+        first breakpoint is at ``smooth_until`` (s).
 
         Raises
         ------
@@ -88,7 +91,7 @@ class IncrementalRun(ABC):
         """
         self._hold(t, force)
         self._evaluator.between(-np.inf, np.inf)
-        memory = start(self._evaluator, self.method, t, state, self.norm, np.inf)
+        memory = start(self._evaluator, self.method, t, state, self.norm, smooth_until)
         order = self.method.scheme.controller_order or 1
         first = initial_step(self._evaluator, state, memory, self.norm, span, order, t)
         self._begin(t, state, memory, first)

@@ -35,7 +35,7 @@ def log_start(name: str, options: RunOptions, norm: ErrorNorm, by: str) -> None:
     step, method = options.step, options.method
     size = f"rtol {norm.rtol:g}" if step is None else f"steps of {step:g} s"
     log.info(
-        "%s: from t = %g to %g s with %s %s, %s, by the %s",
+        "%s: from t = %g to %g s with %s %s, %s, backend %s",
         name,
         options.t0,
         options.t_end,

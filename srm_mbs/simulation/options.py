@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, joined_names, safe_repr, warn
+from srm_mbs.errors import InputError, joined_names, known_names, safe_repr, warn
 from srm_mbs.integration.control.prescribed_times import PLACEMENTS
 from srm_mbs.integration.methods.base import NEGLIGIBLE, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM, is_split
 from srm_mbs.integration.methods.tableaus import get_tableau
 from srm_mbs.integration.methods.thesis.srm import SRM
-from srm_mbs.model.numbers import choice, finite_array, finite_number, flag
+from srm_mbs.model.numbers import choice, finite_array, finite_number, flag, positive_number
 
 LOOSEST_RTOL = 1e-4
 """Looser tolerances let sweeps jump to another branch at a change point."""
@@ -127,7 +127,7 @@ class RunOptions(NamedTuple):
         t0, t_end = span
         for name in ("step", "first_step", "max_step"):
             if getattr(self, name) is not None:
-                positive(getattr(self, name), name, unit)
+                positive_number(getattr(self, name), name, unit)
         check_progress(self.progress, arguments)
         return self._replace(
             t0=t0,
@@ -173,21 +173,6 @@ _REPEATABLE = itemgetter(
     )
 )
 """The values of the options of a rerun, from those of a run and :data:`_NOT_REPEATED`."""
-
-
-def positive(value: Any, what: str, unit: str = "") -> float:
-    """``value`` as a positive finite float."""
-    try:
-        number = float(value)
-    except Exception:  # objects may raise anything
-        number = math.nan
-    if not (math.isfinite(number) and number > 0.0):
-        raise InputError(
-            f"{what} = {safe_repr(value)} is not a positive number{unit}",
-            element=what,
-            remedy="Give a positive number",
-        )
-    return number
 
 
 def checked_singular_tolerance(value: Any) -> float:
@@ -261,12 +246,10 @@ def tightest_rtol(scheme: ButcherTableau, constrained: bool) -> float:
     return next(rtol for least, rtol in TIGHTEST_OF_CLOSURES.items() if order >= least)
 
 
-def checked_rtol(
-    value: Any, loosest: float = LOOSEST_RTOL, tightest: float = float(TIGHTEST_RTOL)
-) -> float:
+def checked_rtol(value: Any, loosest: float, tightest: float) -> float:
     """rtol within what the methods can use, from ``tightest`` to ``loosest``; warns where it is
     changed."""
-    rtol = positive(value, "rtol")
+    rtol = positive_number(value, "rtol")
     if rtol > loosest:
         warn(
             f"rtol = {rtol:g} is looser than {loosest:g}, from where a step may jump to "
@@ -293,7 +276,7 @@ def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -
             raise InputError(
                 f"there is no method {safe_repr(method)}",
                 element="method",
-                remedy=f"Known: {', '.join(repr(name) for name in METHODS)}",
+                remedy=known_names(METHODS),
             )
         if tableau is not None:
             get_tableau(tableau)  # refuses what cannot be looked up
@@ -398,7 +381,7 @@ def checked_span(t0: Any, t_end: Any) -> tuple[float, float]:
     """Start and end (s) of a run."""
     start = finite(t0, "t0")
     if start == 0.0:
-        return 0.0, positive(t_end, "t_end", " of seconds")
+        return 0.0, positive_number(t_end, "t_end", " of seconds")
     end = finite(t_end, "t_end")
     if not end > start:
         raise InputError(
@@ -414,7 +397,7 @@ def checked_samples(sample_time: Any, controller: Any, t0: float, t_end: float) 
     none."""
     if sample_time is None:
         return _NO_TIMES
-    period = positive(sample_time, "sample_time", " of seconds")
+    period = positive_number(sample_time, "sample_time", " of seconds")
     if controller is None:
         raise InputError(
             "sample_time is given, but no controller",

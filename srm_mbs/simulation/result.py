@@ -696,8 +696,7 @@ class SimulationResult(RunOutcome):
     def drive_rates(self) -> Mapping[str, FloatArray]:
         """Per drive (n,): the prescribed rate s'(t) (rad/s, m/s); times the force its power."""
         curves = self.mechanism.drive_curves
-        rates = {name: np.array([curve(t)[1] for t in self.t]) for name, curve in curves.items()}
-        return KnownKeys(rates)
+        return KnownKeys({name: curve.at(self.t)[1] for name, curve in curves.items()})
 
     @property
     def coupling_forces(self) -> Mapping[str, FloatArray]:

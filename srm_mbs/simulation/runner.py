@@ -223,7 +223,7 @@ def run_segment(
     options: RunOptions,
     result_type: type[Result],
     workspaces: SuccessiveWorkspaces,
-    before: Segment[Result] | None = None,
+    before: Segment[Result] | None,
 ) -> Segment[Result]:
     """A segment of a run, between the actions of events.
 
@@ -703,7 +703,7 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
         handler.sample = sampler(system, problem.held, watch, controller, interval, kernel_system)
         handler.sample(t0, state)
     if evaluator is None:
-        memory = start(system, method, t0, state, norm, options.t_end)
+        memory = start(system, method, t0, state, norm, handler.end)
         memory.stiff = problem.stiff
         found = integrate_steps(
             system,
@@ -721,7 +721,7 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
         return found
     check_embedded(method.scheme, options.step)
     given = options.first_step or problem.last_step or None
-    first = first_stage(evaluator, method, t0, state, norm, options.t_end, problem.stiff)
+    first = first_stage(evaluator, method, t0, state, norm, handler.end, problem.stiff)
     try:
         run = _compiled_run(problem, kernel_system, first, given, handler)
     except ArithmeticError:  # the reference raises the error that says why
@@ -913,6 +913,8 @@ class FinishedRun:
         self.backend, self._passages = problem.backend, problem.passages
         self._kernel_system = None if shared(problem.system) else kernel_system
         self._record, self._counters = record, counters
+        if self._passages is not None and self._passages.examined:
+            self._passages.ended(record.end_of_steps().time)
         # Before anything reads the dense output, which evaluates stages.
         self._work = self._system.evaluations, self._system.factorisations
         self.controlled = options.controller is not None or self._system.has_user_forces

@@ -34,8 +34,9 @@ from srm_mbs.integration.kernel.events import contact_probe
 from srm_mbs.integration.kernel.system import Evaluator, SuccessiveWorkspaces
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
+from srm_mbs.model.numbers import positive_number
 from srm_mbs.model.validation import STATE_ARGUMENTS
-from srm_mbs.simulation.options import RunOptions, positive
+from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.runner import (
     Segment,
@@ -91,6 +92,11 @@ class Event:
         self.__name__ = getattr(function, "__name__", "<lambda>")
         self.function, self.action = function, action
         self.direction, self.terminal = direction, terminal
+
+    def __repr__(self) -> str:
+        action = getattr(self.action, "__name__", self.action)
+        fixed = f"direction={self.direction!r}, terminal={self.terminal!r}"
+        return f"Event({self.__name__}, {fixed}, action={action})"
 
     def __call__(self, t: float, q: FloatArray, v: FloatArray) -> Any:
         """The value of the function."""
@@ -328,7 +334,7 @@ def _run_segments(
         )
     here = options._replace(t_eval=None)
     if options.sample_time is not None and options.controller is not None:
-        period = positive(options.sample_time, "sample_time", " of seconds")
+        period = positive_number(options.sample_time, "sample_time", " of seconds")
         here = here._replace(controller=_Sampled(options.controller, period))
     parts: list[R] = []
     segment: Segment[R] | None = None
@@ -577,7 +583,7 @@ def _acted(
     try:
         if isinstance(answer, Switch):
             return _switched(mechanism, answer, t, q, v)
-        q, v = answer
+        q, v = _state(answer)
         moved = mechanism.continued(q, v)
         if moved.constrained:
             check_consistent(moved, t, backend, names=STATE_ARGUMENTS)
@@ -586,6 +592,18 @@ def _acted(
         raise EventError(
             f"the action of the event {event.name!r} cannot be carried out: {error}"
         ) from error
+
+
+def _state(answer: Any) -> tuple[Any, Any]:
+    """q and v from the ``answer`` of an action, as they are."""
+    try:
+        q, v = answer
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"it returned {safe_repr(answer)}",
+            remedy="Return None, the state (q, v), or srm.Switch(mechanism)",
+        ) from error
+    return q, v
 
 
 def _curves_from(t: float, old: Mechanism, new: Mechanism) -> dict[str, Curve]:

@@ -28,7 +28,7 @@ from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend, code_is
 from srm_mbs.integration.messages import FailureCause
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.model.numbers import real_array
+from srm_mbs.model.numbers import positive_number, real_array
 from srm_mbs.model.validation import STATE_ARGUMENTS
 from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
 from srm_mbs.simulation.incremental_run import IncrementalRun, KernelRun, ReferenceRun
@@ -37,7 +37,6 @@ from srm_mbs.simulation.options import (
     RunOptions,
     check_embedded,
     finite,
-    positive,
 )
 from srm_mbs.simulation.result import Statistics
 from srm_mbs.simulation.runner import (
@@ -190,7 +189,7 @@ class Simulator:
             rates beyond use: ``t``, ``q`` and ``v`` are then those of the last good inner step.
         """
         started = time.perf_counter()
-        dt = positive(dt, "dt", " of seconds")
+        dt = positive_number(dt, "dt", " of seconds")
         force = self._no_force if tau is None else self._force(tau)
         run, t = self._run, self.t
         end = t + dt
@@ -201,7 +200,7 @@ class Simulator:
         self._last_dt = dt
         if self._pending_start is not None:
             if not np.isfinite(force).all():
-                raise _bad_force(tau)
+                raise _bad_force(tau, len(self._no_force))
             self._begin(*self._pending_start, force, dt)
         self._forces.append(force)
         if self._busy:
@@ -215,7 +214,7 @@ class Simulator:
             else:
                 self._piecewise(t, end, force)
         except ValueError as error:
-            raise _bad_force(tau) from error
+            raise _bad_force(tau, len(self._no_force)) from error
         except SimulationError as error:
             cause = failure_cause(self._mechanism, self.t, self.q, self._watch())
             if cause is None:
@@ -253,8 +252,12 @@ class Simulator:
         SimulationError
             If the first stage cannot be evaluated.
         """
+        smooth_until = math.inf
+        if not self._smooth:
+            after = t + BREAKPOINT_ROUNDING * (abs(t) + dt)
+            smooth_until = min(self._mechanism.breakpoints(after, math.inf), default=math.inf)
         try:
-            self._run.begin(t, state, force, dt)
+            self._run.begin(t, state, force, dt, smooth_until)
         except EvaluationError as error:
             raise SimulationError(f"Stopped at t = {t:.6g} s: {error}.", None) from error
         self._pending_start = None
@@ -285,9 +288,9 @@ class Simulator:
         try:
             force = real_array(tau)  # the caller may change it afterwards
         except (TypeError, ValueError) as error:
-            raise _bad_force(tau) from error
+            raise _bad_force(tau, len(self._no_force)) from error
         if force.shape != self._no_force.shape:
-            raise _bad_force(tau)
+            raise _bad_force(tau, len(self._no_force))
         return force
 
     def _grid(self, length: float) -> float:
@@ -420,9 +423,9 @@ def _failed(t: float, cause: FailureCause) -> SimulationError:
     return SimulationError(f"Stopped at t = {t:.6g} s: {cause.clause}. {cause.remedy}.", None)
 
 
-def _bad_force(tau: Any) -> InputError:
+def _bad_force(tau: Any, size: int) -> InputError:
     return InputError(
         f"tau = {safe_repr(tau)} is not a vector of finite generalised forces",
         element="tau",
-        remedy="Give nv numbers or {joint: force}, N and N m",
+        remedy=f"Give {size} numbers or {{joint: force}}, N and N m",
     )

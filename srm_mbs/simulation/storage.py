@@ -146,7 +146,7 @@ def _settings_entry(settings: Settings) -> dict[str, Any]:
 # -- writing ----------------------------------------------------------------------------------
 
 
-def save_solution(solution: SimulationResult, path: Path, full_paths: bool = False) -> None:
+def save_solution(solution: SimulationResult, path: Path, full_paths: bool) -> None:
     """Write a run of one segment to ``path``; see :meth:`srm_mbs.Solution.save`.
 
     Raises
@@ -163,7 +163,7 @@ def save_solution(solution: SimulationResult, path: Path, full_paths: bool = Fal
     log.info("written: %s", path)
 
 
-def save_segments(solution: SegmentedResult, path: Path, full_paths: bool = False) -> None:
+def save_segments(solution: SegmentedResult, path: Path, full_paths: bool) -> None:
     """Write a run of several segments to ``path``.
 
     Raises
@@ -321,7 +321,7 @@ def _drive_starts(solution: SimulationResult) -> dict[str, float] | None:
 # -- reading ----------------------------------------------------------------------------------
 
 
-def load_result(path: Path, types: ResultTypes[R], reach: Reach = NO_REACH) -> R:
+def load_result(path: Path, types: ResultTypes[R], reach: Reach) -> R:
     """Read a saved run; see :func:`srm_mbs.load_solution`.
 
     Parameters
@@ -341,7 +341,7 @@ def load_result(path: Path, types: ResultTypes[R], reach: Reach = NO_REACH) -> R
         return load_from(file, path, types, reach)
 
 
-def load_from(file: IO[bytes], path: Path, types: ResultTypes[R], reach: Reach = NO_REACH) -> R:
+def load_from(file: IO[bytes], path: Path, types: ResultTypes[R], reach: Reach) -> R:
     """The result that :func:`load_result` reads, from an open file; ``path`` names it, and its
     folder is searched for meshes."""
     with _naming(str(path)):
@@ -415,7 +415,7 @@ def _check_continues(segments: Sequence[SimulationResult]) -> None:
         raise ValueError("it begins before the end of the segment before it")
 
 
-def run_from(arrays: Arrays, path: Path, result_type: type[R], reach: Reach = NO_REACH) -> R:
+def run_from(arrays: Arrays, path: Path, result_type: type[R], reach: Reach) -> R:
     """The run of one segment in the ``arrays`` of the file ``path``.
 
     Raises

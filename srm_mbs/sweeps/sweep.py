@@ -16,7 +16,8 @@ from uuid import uuid4
 
 from srm_mbs.api import simulate
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError, get_logger, safe_repr
+from srm_mbs.errors import InputError, get_logger, known_names, safe_repr
+from srm_mbs.model.numbers import positive_integer
 from srm_mbs.simulation.monitoring import Counted, counting
 from srm_mbs.simulation.options import check_progress, checked_span
 from srm_mbs.simulation.runner import mechanism_method
@@ -134,12 +135,8 @@ def sweep(
                 element=name,
                 remedy="Give a function",
             )
-    if chunk is not None and (not isinstance(chunk, int) or chunk < 1):
-        raise InputError(
-            f"chunk = {safe_repr(chunk)} is not a positive number of cases",
-            element="chunk",
-            remedy="Give 1 or more",
-        )
+    if chunk is not None:
+        chunk = positive_integer(chunk, "chunk", "Give 1 or more", " of cases")
     if executor is not None and not hasattr(executor, "submit"):
         raise InputError(
             f"{safe_repr(executor)} has no submit",
@@ -192,7 +189,7 @@ def _check_options(options: Mapping[str, Any]) -> None:
             raise InputError(
                 f"there is no option {name!r}",
                 element=name,
-                remedy=f"Known: {', '.join(sorted(known - set(_REFUSED_OPTIONS)))}",
+                remedy=known_names(sorted(known - set(_REFUSED_OPTIONS))),
             )
     mechanism_method(options.get("method", "psrm"), options.get("tableau"))
 

@@ -111,7 +111,7 @@ def test_python_and_the_command_line_use_the_kernel_in_every_folder(
     assert Path(source).is_relative_to(imported), run.stderr
     assert backend == "kernel"
     assert [text.endswith("finished, kernel)") for text in solutions] == [True, True]
-    assert run.stderr.count(", by the kernel\n") == 2
+    assert run.stderr.count(", backend kernel\n") == 2
     assert "Warning" not in run.stderr
 
     for start in ([machine.script], ["-m", "srm_mbs"]):
@@ -155,7 +155,7 @@ def test_a_checkout_with_changed_sources_warns_once_and_its_benchmark_refuses(
     _, *solutions, backend = run.stdout.splitlines()
     assert backend == "python"
     assert [text.endswith("finished, python)") for text in solutions] == [True, True]
-    assert run.stderr.count(", by the python\n") == 2
+    assert run.stderr.count(", backend python\n") == 2
     (warning,) = (line for line in run.stderr.splitlines() if "SrmWarning" in line)
     assert explains(warning)
 

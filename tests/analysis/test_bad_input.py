@@ -46,6 +46,7 @@ def test_what_cannot_be_analysed_is_refused(tmp_path: Path) -> None:
         "linearise: no step": lambda: linearise(four, step=0.0),
         "linearise: small step": lambda: linearise(four, step="small"),
         "mode shape: number": lambda: found.mode_shape(2),
+        "mode shape: amplitude as a word": lambda: linearise(five).mode_shape(0, amplitude="far"),
         "mode shape: amplitude": lambda: linearise(five).mode_shape(0, amplitude=3.0),
         "mode shape: no frames": lambda: found.mode_shape(0, frames=0),
         "mode shape: half a frame": lambda: found.mode_shape(0, frames=2.5),

@@ -207,7 +207,7 @@ def test_a_run_logs_its_settings_end_and_singular_passages(logged: Any) -> None:
     assert said(logged, "slider_crank: assembled with crank held, closed to ", "DEBUG")
     solution = srm.simulate(mechanism, 5.0, rtol=1e-7)
     by = solution.settings.backend
-    assert said(logged, f"slider_crank: from t = 0 to 5 s with PSRM auto, rtol 1e-07, by the {by}")
+    assert said(logged, f"slider_crank: from t = 0 to 5 s with PSRM auto, rtol 1e-07, backend {by}")
     assert said(logged, f"slider_crank: finished after {solution.stats.steps} steps")
     assert said(logged, f"slider_crank: {solution.message}")
     assert len(solution.crossings) == 2

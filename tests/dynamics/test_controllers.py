@@ -75,7 +75,7 @@ def test_a_linearisation_takes_forces_by_joint_name() -> None:
             r"force of the joint 'hip' at t = 0 s: there is no joint 'hip'\. Known: a, b",
         ),
         ({3: 1.0}, r"there is no joint 3\. Known: a, b, c, d"),
-        ({"b": 1.0}, r"'b' is an array of shape \(\) .* it must be 3 finite numbers"),
+        ({"b": 1.0}, r"'b' is 1\.0 at t = 0 s; it must be 3 finite numbers"),
         ({"b": [1.0, np.nan, 0.0]}, "'b' is values that are not finite"),
         ({"a": np.zeros(3)}, r"'a' is an array of shape \(3,\) .* 6 finite numbers"),
         ({"c": "much"}, "'c' is 'much' at t = 0 s; it must be 3 finite numbers"),

@@ -371,7 +371,7 @@ def test_what_cannot_be_a_path_is_refused(path: Any) -> None:
 
 @pytest.mark.parametrize("n", [0, -1, 1.5, "2", None])
 def test_an_n_four_bar_needs_a_positive_number_of_loops(n: Any) -> None:
-    with pytest.raises(srm.InputError, match="n >= 1"):
+    with pytest.raises(srm.InputError, match="is not a positive whole number of loops"):
         srm.n_four_bar(n)
 
 

@@ -162,7 +162,7 @@ def test_nothing_is_overwritten_unless_asked_for(tmp_path: Path) -> None:
     srm.convert(path, out)
     before = out.read_text()
     for present in (out, out.with_suffix(".urdf")):
-        with pytest.raises(srm.InputError, match="the file exists"):
+        with pytest.raises(srm.InputError, match=r"the file exists. .* force=True"):
             srm.convert(path, out)
         present.write_text("old")
     srm.convert(path, out, force=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,29 @@ def test_an_angle_of_a_start_above_two_turns_is_doubted(
     (said,) = doubts(changed(toml=lambda text: text.replace(old, new)))
     assert f"{where}: the angle" in said
     assert radians in said
+
+
+def test_rotations_of_frames_above_two_turns_are_doubted(changed: Callable[..., Path]) -> None:
+    place = r'(<joint name="coupler".*?xyz="1 0 0")'
+    turned = partial(re.sub, place, r'\1 rpy="0 360 0"', flags=re.DOTALL)
+    (said,) = doubts(changed(lambda text: turned(text)))
+    assert "joint 'coupler': the angle 360 of rpy is more than two turns" in said
+    assert "360 degrees are 6.28319 rad" in said
+    old, new = "xyz = [2.0, 0.0, 0.0]", "xyz = [2.0, 0.0, 0.0], rpy = [0, -90, 0]"
+    (said,) = doubts(changed(toml=lambda text: text.replace(old, new)))
+    assert "loop 'pin': the angle -90 of rpy" in said
+
+
+def test_an_angle_in_degrees_is_a_hint_where_loops_do_not_close(
+    changed: Callable[..., Path],
+) -> None:
+    start, guess = "q = { crank = 1.0 }", "rocker = 1.413"
+    held = changed(
+        toml=lambda text: text.replace(start, "q = { rocker = 60.0 }").replace(guess, "crank = 1.0")
+    )
+    with pytest.raises(srm.AssemblyError, match=r"60 degrees are 1\.0472 rad") as caught:
+        srm.load(held)
+    assert "nearest values that close" in str(caught.value)
 
 
 def test_positions_of_slides_are_no_angles() -> None:

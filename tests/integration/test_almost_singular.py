@@ -285,3 +285,32 @@ def test_dissipation_and_a_controller_act_in_the_layer() -> None:
 def test_a_tolerance_that_is_no_number_is_refused(value: Any) -> None:
     with pytest.raises(srm.InputError, match="singular_tolerance"):
         srm.simulate(load("slider_crank"), 1.0, singular_tolerance=value)
+
+
+def driven_four_bar(crank: float) -> srm.Mechanism:
+    return srm.planar(
+        points={"O": (0, 0), "A": (crank, 0), "B": (120, 80), "C": (150, 0)},
+        bars={"crank": ("O", "A"), "coupler": ("A", "B"), "rocker": ("B", "C")},
+        ground=("O", "C"),
+        unit="mm",
+        mass_per_length=1.0,
+        drives={"O": 6.28},
+    )
+
+
+@pytest.mark.parametrize("backend", ["kernel", "python"])
+@pytest.mark.parametrize("t_end", [1.0, 1.2])
+def test_a_linkage_far_from_its_singular_configurations_is_not_said_to_avoid_one(
+    backend: str, t_end: float
+) -> None:
+    """The crank turns fully: rocker and coupler are never in line."""
+    run = srm.simulate(driven_four_bar(38.587174348697395), t_end, backend=backend)
+    assert run.message == f"The run reached t = {t_end:g} s."
+
+
+@pytest.mark.parametrize("backend", ["kernel", "python"])
+def test_a_run_that_stops_before_a_passage_does_not_report_it(backend: str) -> None:
+    with pytest.warns(srm.SrmWarning, match="dead point"):
+        run = srm.simulate(driven_four_bar(47.0), 0.7, backend=backend)
+    assert run.t[-1] < 0.4321
+    assert "avoids" not in run.message

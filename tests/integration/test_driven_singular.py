@@ -127,6 +127,32 @@ def test_a_driven_mechanism_starts_on_and_next_to_a_singular_configuration(
         assert solution.drift.max() < 1e-9
 
 
+SUDDEN_LAWS: dict[str, Callable[[], srm.Law]] = {
+    "vibration": lambda: srm.Sine(3e-3, omega=100.0, phase=0.3),
+    "knots": lambda: srm.Table(
+        [0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 2.0], [0.0, 0.0, 3e-3, 3e-3, 0.0, 2e-3, 0.1]
+    ),
+}
+"""Of these a motion feels much while it turns by a fraction of a radian."""
+
+
+@on_both
+@pytest.mark.parametrize("law", SUDDEN_LAWS)
+def test_forces_that_change_while_a_motion_leaves_a_singular_start_are_resolved(
+    law: str, backend: str
+) -> None:
+    chosen = SUDDEN_LAWS[law]()
+    mechanism = lifted(chosen, TOP, 2.0)
+    exact = free_crank(chosen, TOP, 2.0, 0.3)
+    for rtol in (1e-6, 1e-9):
+        solution = srm.simulate(mechanism, 0.3, rtol=rtol, backend=backend)
+        assert crank_error(solution, exact) < 100.0 * rtol
+        assert solution.drift.max() < 1e-9
+        simulator = srm.Simulator(mechanism, rtol=rtol, backend=backend)
+        q, v = simulator.step(0.3)
+        assert np.abs([-q[1] - exact[0], -v[1] - exact[1]]).max() < 100.0 * rtol
+
+
 @pytest.mark.parametrize("beside", [0.0, 1e-9, -1e-6, 1e-5, -1e-4, 1e-3])
 @pytest.mark.parametrize("rtol", [1e-6, 1e-9])
 def test_a_driven_run_may_end_on_and_next_to_a_singular_configuration(

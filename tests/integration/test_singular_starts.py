@@ -15,8 +15,6 @@ from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.singularities.branch_limit import branch_limit, branch_next_to
 from srm_mbs.dynamics.singularities.local_analysis import (
-    SingularConfiguration,
-    analyse_singular,
     nearest_singular,
 )
 from srm_mbs.integration import singular_endpoints
@@ -26,6 +24,7 @@ from tests.support.bundled import load
 from tests.support.convergence import fitted_order
 from tests.support.mechanisms import ball_dead_point, distance, floating_slider_crank
 from tests.support.reduced import error_at_end
+from tests.support.singularities import singular_at
 from tests.support.slider_crank import state
 from tests.support.snapshots import check_messages, refused
 
@@ -312,14 +311,6 @@ def test_starts_from_which_the_motion_is_not_determined_are_refused_with_their_b
 
 
 # --- the analysis behind it ---------------------------------------------------------------------
-
-
-def singular_at(mechanism: Mechanism, q: Any) -> SingularConfiguration:
-    geometry = ClosureGeometry(mechanism, mechanism.q0)
-    rank = mechanism.structure.rank
-    found = nearest_singular(geometry, np.asarray(q, dtype=float), rank, reach=0.3)
-    assert found is not None
-    return analyse_singular(geometry, found, rank)
 
 
 CASES: dict[str, Any] = {

@@ -12,7 +12,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
-from tests.support import reduced, tangency
+from tests.support import reduced, tangency, turning
+from tests.support.backends import on_both
 from tests.support.slider_crank import moving, off_branch
 
 TOP = np.pi / 2.0
@@ -81,7 +82,7 @@ def swung(reach: float, tableau: str, tol: float = 1e-8) -> tuple[srm.Solution, 
 
 
 @TABLEAUS
-@pytest.mark.parametrize("reach", [0.3, 0.03, 0.01, 1e-3])
+@pytest.mark.parametrize("reach", [0.3, 0.03, 0.01, 1e-3, 1e-4])
 def test_a_motion_that_turns_back_beyond_passes_twice(tableau: str, reach: float) -> None:
     solution, error = swung(reach, tableau)
     assert error.max() < 1e-7
@@ -103,6 +104,47 @@ def test_a_motion_that_turns_back_before_passes_nowhere(tableau: str, reach: flo
     assert error.max() < 1e-7
     assert solution.crossings == ()
     assert solution.bifurcations == ()
+
+
+@on_both
+@pytest.mark.parametrize("reach", [1e-2, 1e-3, 1e-4, 1e-5, -1e-5, -1e-4, -1e-3, -1e-2])
+def test_swings_pass_twice_where_they_turn_back_beyond_and_never_where_before(
+    reach: float, backend: str
+) -> None:
+    """Both change points of the parallelogram, at the angles 0 and -pi of its crank."""
+    motion, t_end = turning.lifted(reach), 6.0
+    solution = srm.simulate(motion.mechanism, t_end, rtol=1e-9, backend=backend)
+    assert solution.success
+    start = [float(motion.mechanism.q0[0]), float(motion.mechanism.v0[0])]
+    exact = solve_ivp(
+        reduced.parallelogram(),
+        (0.0, t_end),
+        start,
+        "DOP853",
+        events=lambda t, y: np.sin(y[0]),
+        max_step=1e-3,
+        rtol=3e-14,
+        atol=1e-16,
+    )
+    expected = exact.t_events[0]
+    assert len(expected) == (10 if reach > 0.0 else 0)
+    found = [crossing.time for crossing in solution.crossings]
+    # where the motion turns, an error of the angle is one of time over the rate
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7 / np.sqrt(abs(reach)))
+    assert {crossing.kind for crossing in solution.crossings} <= {"passed"}
+
+
+@pytest.mark.parametrize("reach", [1e-3, 1e-4])
+def test_a_run_that_an_event_ends_between_two_passages_has_the_first(reach: float) -> None:
+    mechanism = turning.lifted(reach).mechanism
+    first, second, *_ = srm.simulate(mechanism, 1.0, rtol=1e-9).crossings
+
+    def halfway(t: float, q: Any, v: Any) -> float:
+        return t - 0.5 * (first.time + second.time)
+
+    cut = srm.simulate(mechanism, 1.0, rtol=1e-9, events=[srm.Event(halfway, terminal=True)])
+    assert cut.status == "event"
+    assert [crossing.time for crossing in cut.crossings] == pytest.approx([first.time], abs=1e-9)
 
 
 @TABLEAUS

@@ -442,6 +442,22 @@ def test_an_anchor_on_a_frame_equals_the_same_anchor_on_its_link(kind: str) -> N
         assert_close(x, y, atol=1e-13)
 
 
+def test_a_coupling_of_one_joint_is_named_after_it() -> None:
+    lock = LoopClosure("coupling", joints="crank", coefficients=[1.0])  # type: ignore[arg-type]
+    assert lock.name == "coupling_crank"
+    assert lock.joints == ("crank",)
+
+
+def test_closures_drives_and_actuators_show_only_what_was_given() -> None:
+    anchor = "Anchor(link='rod', xyz=(1.0, 0.0, 0.0))"
+    pin_joint = LoopClosure("point", Anchor("rod", (1.0, 0.0, 0.0)), Anchor(frame="tip"), name="p")
+    drive = srm.Drive(srm.ConstantSpeed(2.0), "crank")
+    places = f"a={anchor}, b=Anchor(frame='tip')"
+    assert repr(pin_joint) == f"LoopClosure(type='point', {places}, name='p')"
+    assert repr(drive) == "Drive(law=ConstantSpeed(speed=2.0), joint='crank', name='crank')"
+    assert repr(srm.Actuator("crank", gear=2.0)) == "Actuator(joint='crank', gear=2.0)"
+
+
 def test_an_anchor_on_a_link_takes_its_place_after_the_name() -> None:
     place = (1.0, 0.0, 0.5)
     for given in (place, list(place), np.array(place)):

@@ -53,6 +53,13 @@ def test_values_rates_and_accelerations_are_continuous_at_the_knots(law: Law) ->
         np.testing.assert_allclose(before, after, rtol=0.0, atol=1e-12)
 
 
+@every_law
+def test_many_times_have_the_values_of_each(law: Law) -> None:
+    curve, times = law.curve(0.4), np.linspace(-0.5, 3.0, 71)
+    for many, each in zip(curve.at(times), zip(*map(curve, times))):
+        np.testing.assert_allclose(many, each, rtol=1e-15, atol=1e-15)
+
+
 def test_the_laws_have_their_closed_forms() -> None:
     assert LAWS["constant speed"].curve(1.0)(2.0) == (-4.0, -2.5, 0.0)
     assert LAWS["sine in Hz"].curve()(1.1)[0] == pytest.approx(
@@ -167,3 +174,11 @@ def test_columns_of_a_csv_file_are_found_by_name(tmp_path: Path) -> None:
     path = tmp_path / "motion.csv"
     path.write_text("angle, t ,other\n1.5,0.0,7\n\n2.5,0.1,8\n")
     np.testing.assert_array_equal(read_csv(path).columns(("t", "angle")), [[0.0, 1.5], [0.1, 2.5]])
+
+
+def test_a_table_with_semicolons_is_told_to_have_commas(tmp_path: Path) -> None:
+    """Spreadsheets write them, and decimal commas, where numbers have these."""
+    path = tmp_path / "motion.csv"
+    path.write_text("t;angle\n0,0;1,5\n0,1;2,5\n")
+    with pytest.raises(srm.InputError, match=r"no column 't'. Separate columns by commas"):
+        read_csv(path).columns(("t", "angle"))

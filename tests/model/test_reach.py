@@ -50,6 +50,8 @@ def test_a_mesh_outside_is_drawn_only_if_the_caller_allows_it(
         caplog.clear()
         assert drawn(srm.load(path, allow_outside=True))
         assert drawn(srm.load(path, mesh_dirs=[model.parent / "other"]))
+        assert drawn(srm.load(path, mesh_dirs=str(model.parent / "other")))
+        caplog.clear()
 
 
 def test_a_symbolic_link_does_not_lead_outside(model: Path) -> None:
@@ -194,5 +196,7 @@ def test_every_command_that_loads_a_file_has_the_option(model: Path) -> None:
 def test_wrong_options_are_refused(model: Path) -> None:
     with pytest.raises(srm.InputError, match="mesh_dirs: there is no folder"):
         Reach.of(model / "a", mesh_dirs=[model / "nowhere"])
+    with pytest.raises(srm.InputError, match="mesh_dirs = 3 is not a list of folders"):
+        srm.load("four_bar", mesh_dirs=3)  # type: ignore[arg-type]
     with pytest.raises(srm.InputError, match="allow_outside = 1 is not"):
         Reach.of(model / "a", allow_outside=1)  # type: ignore[arg-type]

@@ -447,8 +447,9 @@ def test_runs_start_at_any_time(ball: srm.Mechanism, backend: str) -> None:
     ("action", "message"),
     [
         (lambda t, q, v: 1 / 0, "raised ZeroDivisionError"),
-        (lambda t, q, v: 3, "cannot be carried out"),
-        (lambda t, q, v: (q,), "cannot be carried out"),
+        (lambda t, q, v: 3, "it returned 3. Return None, the state (q, v), or srm.Switch"),
+        (lambda t, q, v: (q,), "Return None, the state (q, v), or srm.Switch(mechanism)"),
+        (lambda t, q, v: flywheels(), "it returned Mechanism('"),
         (lambda t, q, v: (q, [1.0, 2.0]), "finite numbers"),
         (lambda t, q, v: srm.Switch(None), "same joints"),  # type: ignore[arg-type]
         (lambda t, q, v: srm.Switch(flywheels()), "same joints"),
@@ -512,11 +513,23 @@ def test_a_switch_to_closures_that_are_open_is_refused() -> None:
     assert "violates the closures" in solution.message
 
 
+def test_an_event_is_shown_with_its_attributes() -> None:
+    event = srm.Event(height, direction=-1, action=height)
+    assert repr(event) == "Event(height, direction=-1, terminal=False, action=height)"
+    assert repr(srm.Event(height)) == "Event(height, direction=0.0, terminal=False, action=None)"
+
+
 def test_bad_events_and_loops_are_refused(ball: srm.Mechanism) -> None:
     pinned = load("slider_crank")
+
+    def falling(t: float, q: Any, v: Any) -> float:
+        return float(q[0])
+
+    falling.action = "stop"  # type: ignore[attr-defined]
     calls = {
         "event of a number": lambda: srm.Event(3),  # type: ignore[arg-type]
         "action of a number": lambda: srm.Event(height, action=3),  # type: ignore[arg-type]
+        "action of a text": lambda: srm.simulate(ball, 1.0, events=falling),
         "terminal = -1": lambda: srm.simulate(ball, 1.0, events=floor(0.5, terminal=-1)),
         "with a loop twice": lambda: pinned.with_loop(pinned.loops[0]),
         "restitution above 1": lambda: srm.impact(ball, ball.q0, ball.v0, [1.0], 2.0),

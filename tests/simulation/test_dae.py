@@ -10,6 +10,7 @@ import pytest
 
 import srm_mbs as srm
 from benchmarks.thesis.entries import PRINTED
+from srm_mbs.errors import EventError
 from tests.support.daes import (
     START_PASSING,
     START_TWO,
@@ -410,6 +411,15 @@ def test_a_function_that_fails_on_the_way_leaves_the_partial_solution(
     with pytest.raises(srm.SimulationError) as caught:
         srm.solve_dae(problem, (0.0, 1.0), START_TWO, raise_on_failure=True)
     assert caught.value.solution.t[-1] <= 0.5
+
+
+def test_an_event_that_fails_at_its_first_call_raises_at_once() -> None:
+    with pytest.raises(EventError) as caught:
+        srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO, events=lambda t, x: 1 / 0)
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+    assert caught.value.t == 0.0
+    with pytest.raises(EventError, match="must return one finite number"):
+        srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO, events=lambda t, x: x)
 
 
 INVALID: dict[str, dict[str, Any]] = {

@@ -256,6 +256,18 @@ def test_invalid_options_are_refused_before_any_stepping(four_bar: srm.Mechanism
     check_messages("options", messages)
 
 
+@pytest.mark.parametrize("backend", ["kernel", "python"])
+@pytest.mark.parametrize(("step", "longest"), [(0.1, 0.1), (0.1, 0.05), (0.02, 0.002)])
+def test_fixed_steps_that_a_longest_step_divides_reach_the_end(
+    four_bar: srm.Mechanism, backend: str, step: float, longest: float
+) -> None:
+    """Ten times 0.1 s, added up, are less than 1 s by a unit of rounding."""
+    run = srm.simulate(four_bar, 1.0, step=step, max_step=longest, backend=backend)
+    assert run.success, run.message
+    assert len(run.t) == round(1.0 / longest) + 1
+    np.testing.assert_allclose(np.diff(run.t), longest, rtol=1e-8)
+
+
 def test_max_step_and_first_step_are_obeyed(four_bar: srm.Mechanism) -> None:
     solution = srm.simulate(four_bar, 1.0, max_step=0.01, first_step=1e-4)
     h = np.diff(solution.steps.times)

@@ -20,6 +20,15 @@ def states(model: pin.Model, count: int = 4, seed: int = 0) -> Iterator[tuple[Fl
         yield q, rng.standard_normal(model.nv)
 
 
+def states_around(mechanism: srm.Mechanism, count: int) -> list[tuple[FloatArray, FloatArray]]:
+    """``count`` random q (nq,), up to 1 (rad, m) from q0 in each direction, and v (nv,) up to 2."""
+    model, rng = mechanism.model, np.random.default_rng(8)
+    return [
+        (pin.integrate(model, mechanism.q0, rng.uniform(-1, 1, nv)), rng.uniform(-2, 2, nv))
+        for nv in [model.nv] * count
+    ]
+
+
 def mass_matrix(model: pin.Model, q: FloatArray) -> FloatArray:
     """M (nv, nv), both triangles."""
     M = pin.crba(model, model.createData(), q)

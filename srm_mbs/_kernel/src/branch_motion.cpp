@@ -1,7 +1,7 @@
 #include "branch_motion.hpp"
 
-#include <limits>
 
+#include "limits.hpp"
 #include "linear.hpp"
 
 namespace srm {
@@ -29,8 +29,8 @@ void BranchMotion::advance(double t, double t_new, const MultiplierHistory& know
     memory.sigma = point.sigma;
     memory.history = known;
     // Known everywhere: every stage takes the interpolated multiplier.
-    memory.history->known_until = std::numeric_limits<double>::infinity();
-    memory.history->known_below = std::numeric_limits<double>::infinity();
+    memory.history->known_until = infinity;
+    memory.history->known_below = infinity;
     point.state = step_.make(t, t_new - t, point.state.data(), memory, 1.0).state;
 }
 
@@ -116,7 +116,7 @@ bool BranchMotion::on_curve(double t, const BranchCurve& curve, BranchPoint& poi
         add(weights[i] * share * share, &curve.quadratic[i * nv], z.data(), nv);
     }
     System::ZoneView dropped;
-    dropped.threshold = std::numeric_limits<double>::infinity();
+    dropped.threshold = infinity;
     system_.evaluate(t, point.state.data(), dropped);
     system_.rate(point.rate.data());
     for (int i = 0; i < nv; ++i) rates[i] = point.rate[nv + i] / curve.unit[i];

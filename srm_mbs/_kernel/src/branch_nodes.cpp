@@ -3,9 +3,9 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <limits>
 
 #include "errors.hpp"
+#include "limits.hpp"
 #include "linear.hpp"
 
 namespace srm {
@@ -99,7 +99,7 @@ bool BranchNodes::follow(int k, double t, const double* from,
     double* const node = &nodes_[k * nx_];
     std::fill(closing, closing + nv_, 0.0);
     const double* const v = from + nx_ - nv_;
-    double last = std::numeric_limits<double>::infinity();
+    double last = infinity;
     for (int iteration = 0; iteration < constants_.node_iterations; ++iteration) {
         for (int i = 0; i < nv_; ++i) step_[i] = places[k] * direction[i] + closing[i];
         std::fill(step_.begin() + nv_, step_.end(), 0.0);

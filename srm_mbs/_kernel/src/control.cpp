@@ -4,14 +4,13 @@
 #include <cmath>
 #include <numeric>
 
+#include "limits.hpp"
 #include "linear.hpp"
 
 namespace srm {
 
 namespace {
 
-constexpr double inf = std::numeric_limits<double>::infinity();
-constexpr double nan = std::numeric_limits<double>::quiet_NaN();
 
 std::vector<double> with_end(const ButcherTableau& scheme) {
     std::vector<double> out(scheme.c);
@@ -33,7 +32,7 @@ double sigma_slope(const std::vector<double>& abscissae, const std::vector<doubl
 // the clock does.
 Proposal over(double t, double h, const Constants& constants, bool placed = false) {
     const double t_new = t + h, size = std::abs(t_new);
-    if (std::nextafter(size, inf) - size > constants.clock_rounding * h) h = t_new - t;
+    if (std::nextafter(size, infinity) - size > constants.clock_rounding * h) h = t_new - t;
     return {h, t_new, placed};
 }
 
@@ -78,7 +77,7 @@ StepDecision PIControl::decide(const Proposal& proposal, const StepResult* resul
 Proposal FixedStep::propose(double t, double limit, IntegratorState&) {
     double target = t0_ + static_cast<double>(index_) * step_;
     if (target > t_end_ - 1e-9 * step_) target = t_end_;
-    if (limit < target - t) return over(t, limit, constants_);
+    if (limit < target - t - sliver()) return over(t, limit, constants_);
     return {target - t, target};
 }
 
@@ -145,7 +144,7 @@ SingularityPlacement::SingularityPlacement(std::unique_ptr<Control> inner,
       arrival_(first_arrival_),
       members_{{scheme, constants.clearance, scatters ? constants.scatter_from : 0.0},
                {stiff, constants.clearance, scatters ? constants.scatter_from : 0.0}},
-      zero_(nan) {}
+      zero_(not_a_number) {}
 
 Proposal SingularityPlacement::propose(double t, double limit, IntegratorState& memory) {
     places_ = &members_[memory.stiff];
@@ -212,15 +211,15 @@ double SingularityPlacement::better_step(double h, const std::vector<double>& si
                                          double slope, bool last) const {
     const double reach =
         std::min(constants_.too_close * std::max(slope_, slope) * h, 0.5 * sigmas[0]);
-    double lowest = inf, lowest_movable = inf;
+    double lowest = infinity, lowest_movable = infinity;
     for (std::size_t j = 0; j < sigmas.size(); ++j) {
         lowest = std::min(lowest, sigmas[j]);
         const double c = places_->abscissae[j];
         if (c > 0.0 && (!last || c < 1.0)) lowest_movable = std::min(lowest_movable, sigmas[j]);
     }
-    if (!(lowest < reach) || !(lowest_movable < reach)) return nan;
+    if (!(lowest < reach) || !(lowest_movable < reach)) return not_a_number;
     const double zero = zero_within(places_->abscissae, sigmas);
-    if (!(zero > 0.0)) return nan;
+    if (!(zero > 0.0)) return not_a_number;
     return places_->gaps.longest_step(zero * h, 0.98 * h);
 }
 
@@ -274,7 +273,7 @@ StepDecision SingularityPlacement::decide(const Proposal& proposal, const StepRe
                                            constants_.turning_misfit)) <
                         constants_.turning_sigma);
         lost_branch_ = lost_branch_ && !result->quiet;
-        zero_ = expected_ = nan;
+        zero_ = expected_ = not_a_number;
         const std::vector<double>& sigmas = result->sigmas;
         const double start = sigmas[0], end = sigmas.back();
         if (!result->quiet) {
@@ -350,7 +349,7 @@ StepDecision BranchGuard::decide(const Proposal& proposal, const StepResult* res
     replaced += inner_->replaced - before;
     if (decision == StepDecision::accepted && result) {
         if (suspect) suspect_times.push_back(proposal.t_new);
-        limit_ = inf;
+        limit_ = infinity;
         tries_ = 0;
     }
     return decision;
@@ -441,9 +440,9 @@ double zero_within(const std::vector<double>& abscissae, const std::vector<doubl
         c[i] = abscissae[order[i]];
         sigma[i] = sigmas[order[i]];
     }
-    if (!(*std::max_element(sigma.begin(), sigma.end()) > 0.0)) return nan;
+    if (!(*std::max_element(sigma.begin(), sigma.end()) > 0.0)) return not_a_number;
     const PolynomialFit polynomials(c, n > 4 ? 2 : 1);
-    double best = inf, zero = nan;
+    double best = infinity, zero = not_a_number;
     for (int k = 1; k <= n; ++k) {
         const double after = k < n ? c[k] : 1.1;
         if (after <= c[k - 1]) continue;
@@ -479,8 +478,8 @@ double zero_within(const std::vector<double>& abscissae, const std::vector<doubl
 double extreme_sigma(const std::vector<double>& abscissae, int middle,
                      const std::vector<double>& sigmas, double allowed) {
     const double c = abscissae[middle], start = sigmas[0];
-    if (!(0.1 < c && c < 0.9)) return inf;
-    double best = inf, extreme = inf;
+    if (!(0.1 < c && c < 0.9)) return infinity;
+    double best = infinity, extreme = infinity;
     for (const auto& [sign, last_sign] :
          {std::pair{1.0, 1.0}, {1.0, -1.0}, {-1.0, -1.0}, {-1.0, 1.0}}) {
         const double end = last_sign * sigmas.back();
@@ -493,17 +492,17 @@ double extreme_sigma(const std::vector<double>& abscissae, int middle,
         if (!(misfit < best)) continue;
         best = misfit;
         const double a = parabola.a, b = parabola.b;
-        extreme = b == 0.0 ? inf : start - a * a / (4.0 * b);
+        extreme = b == 0.0 ? infinity : start - a * a / (4.0 * b);
     }
     const auto [low, high] = std::minmax_element(sigmas.begin(), sigmas.end());
     const double misfit = std::sqrt(best / static_cast<double>(sigmas.size()));
-    return misfit <= allowed * (*high - *low) ? extreme : inf;
+    return misfit <= allowed * (*high - *low) ? extreme : infinity;
 }
 
 double zero_ahead(double c, double start, double middle, double end, double horizon) {
-    if (!(end < start)) return nan;
+    if (!(end < start)) return not_a_number;
     const double line = start / (start - end);
-    const double within = line > horizon ? nan : line;
+    const double within = line > horizon ? not_a_number : line;
     double zero = line;
     const Parabola parabola(c, start, middle, end);
     const double a = parabola.a, b = parabola.b, root = a * a - 4.0 * b * start;
@@ -513,7 +512,7 @@ double zero_ahead(double c, double start, double middle, double end, double hori
         return within;
     }
     if (1.0 < zero && zero < horizon) return zero;
-    return 1.0 < line && line < horizon && zero <= 1.0 ? line : nan;
+    return 1.0 < line && line < horizon && zero <= 1.0 ? line : not_a_number;
 }
 
 }  // namespace srm

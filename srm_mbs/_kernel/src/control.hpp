@@ -3,10 +3,10 @@
 #pragma once
 
 #include <algorithm>
-#include <limits>
 #include <memory>
 #include <vector>
 
+#include "limits.hpp"
 #include "step.hpp"
 #include "struct_fields.hpp"
 
@@ -63,7 +63,7 @@ public:
     // The run is at t by steps that no control proposed.
     virtual void moved(double t) = 0;
     // When sigma is expected to vanish; NaN if that is not to be seen.
-    virtual double next_zero() const { return std::numeric_limits<double>::quiet_NaN(); }
+    virtual double next_zero() const { return not_a_number; }
     bool adaptive = true;
     long placed = 0, replaced = 0;
 };
@@ -185,7 +185,7 @@ public:
     double next_zero() const override { return expected_; }
     void moved(double t) override {
         inner_->moved(t);
-        zero_ = expected_ = std::numeric_limits<double>::quiet_NaN();
+        zero_ = expected_ = not_a_number;
         redo_ = 0.0;
         redone_ = 0;
     }
@@ -234,7 +234,7 @@ private:
     StagePlaces members_[2];
     const StagePlaces* places_ = &members_[0];
     double slope_ = 0.0, zero_, zero_error_ = 0.0, redo_ = 0.0;
-    double expected_ = std::numeric_limits<double>::quiet_NaN();
+    double expected_ = not_a_number;
     int redone_ = 0;
 };
 
@@ -268,7 +268,7 @@ public:
     StepDecision decide(const Proposal& proposal, const StepResult* result) override;
     void moved(double t) override {
         inner_->moved(t);
-        limit_ = std::numeric_limits<double>::infinity();
+        limit_ = infinity;
         tries_ = 0;
     }
     void resume(const ControlState& s) override {
@@ -288,7 +288,7 @@ private:
 
     const System& system_;
     const Constants& constants_;
-    double limit_ = std::numeric_limits<double>::infinity();
+    double limit_ = infinity;
     int tries_ = 0;
     mutable std::vector<double> work_;
 };

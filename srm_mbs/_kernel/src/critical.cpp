@@ -1,8 +1,8 @@
 #include "critical.hpp"
 
 #include <cmath>
-#include <limits>
 
+#include "limits.hpp"
 #include "linear.hpp"
 
 namespace srm {
@@ -113,7 +113,7 @@ private:
     bool iterate(double converged) {
         const int size = n_ + rank_ + 1;
         std::vector<double> value(size), matrix;
-        double best = std::numeric_limits<double>::infinity();
+        double best = infinity;
         for (int i = 0; i < constants_.critical_iterations; ++i) {
             fill_value(value);
             const double error = largest(value.data(), size);
@@ -281,7 +281,7 @@ private:
     const int n_, all_, rank_;
     std::vector<double> g_, G_, u_, hessian_, x_, moved_;
     std::vector<double> ahead_, behind_, move_, there_;  // of differentiate()
-    double last_move_ = std::numeric_limits<double>::infinity();
+    double last_move_ = infinity;
     std::vector<int> chosen_;
     double time_ = 0.0, delta_ = 0.0;
 };

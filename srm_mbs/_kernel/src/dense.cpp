@@ -2,9 +2,9 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 #include <stdexcept>
 
+#include "limits.hpp"
 #include "linear.hpp"
 
 namespace srm {
@@ -334,7 +334,7 @@ const DenseOutput::Polynomial& DenseOutput::best_polynomial(System& system, long
     Polynomial& out = polynomials_[step];
     if (!out.points.empty()) return out;
     const bool layer = steps_.layers && steps_.layers[2 * step + 1] > 0.0;
-    double best = std::numeric_limits<double>::infinity();
+    double best = infinity;
     Nodes ends[3], away[3];
     bool same = true;
     for (int k = 0; k < 3; ++k) {

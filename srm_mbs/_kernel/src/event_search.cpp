@@ -4,11 +4,12 @@
 #include <cmath>
 #include <limits>
 
+#include "limits.hpp"
+
 namespace srm {
 
 namespace {
 
-constexpr double infinity = std::numeric_limits<double>::infinity();
 constexpr double epsilon = std::numeric_limits<double>::epsilon();
 
 double sign_above(double value, double floor) {
@@ -21,11 +22,11 @@ template <class Node>
 double interpolated_zero(const Node* points, int count) {
     const auto [b, fb] = points[count - 2];
     const auto [c, fc] = points[count - 1];
-    if (fb == fc) return std::numeric_limits<double>::quiet_NaN();
+    if (fb == fc) return not_a_number;
     const double secant = c - fc * (c - b) / (fc - fb);
     if (count == 2) return secant;
     const auto [a, fa] = points[0];
-    if (fa == fb || fa == fc) return std::numeric_limits<double>::quiet_NaN();
+    if (fa == fb || fa == fc) return not_a_number;
     const double other = b - fb * (b - a) / (fb - fa);
     return secant - fc * (secant - other) / (fc - fa);
 }

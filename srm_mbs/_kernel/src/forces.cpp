@@ -2,11 +2,11 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 
 #include <pinocchio/spatial.hpp>
 
 #include "errors.hpp"
+#include "limits.hpp"
 #include "workspace.hpp"
 
 namespace srm {
@@ -19,7 +19,6 @@ using pinocchio::SE3;
 using Vector6 = Eigen::Matrix<double, 6, 1>;
 
 constexpr double pi = 3.14159265358979323846;
-constexpr double inf = std::numeric_limits<double>::infinity();
 
 using pinocchio_model::Workspace;
 
@@ -365,7 +364,7 @@ double BushingStep::past_half_turn(const Workspace& work, double t) {
     Vector3d turn = rotation_vector(*element_, work);
     nearest(turn.data());
     const double late = past_half_turn(work, t, turn.data(), 1.0);
-    return passed && late == -inf ? inf : late;
+    return passed && late == -infinity ? infinity : late;
 }
 
 // By the rate of the angle; 0 within so many `roundings`.
@@ -373,14 +372,14 @@ double BushingStep::past_half_turn(const Workspace& work, double t,
                                    const double* vector, double roundings) const {
     const Eigen::Map<const Vector3d> turn(vector);
     const double angle = turn.norm();
-    if (angle < 0.5 * pi) return -inf;
+    if (angle < 0.5 * pi) return -infinity;
     const Vector3d spin =
         velocity(element_->a, work).angular() - velocity(element_->b, work).angular();
     const double beyond = angle - pi;
     const double speed =
         turn.dot(placement(element_->b, work).rotation().transpose() * spin) / angle;
-    if (!(speed > 0.0)) return std::copysign(inf, beyond - rounding_);
-    const double spacing = std::nextafter(std::abs(t), inf) - std::abs(t);
+    if (!(speed > 0.0)) return std::copysign(infinity, beyond - rounding_);
+    const double spacing = std::nextafter(std::abs(t), infinity) - std::abs(t);
     const double slack = roundings * (rounding_ + speed * 4.0 * spacing);
     return std::abs(beyond) <= slack ? 0.0 : beyond / speed;
 }

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "limits.hpp"
+
 namespace srm {
 
 void MultiplierHistory::check() const {
@@ -22,7 +24,7 @@ void MultiplierHistory::clear() {
 }
 
 void MultiplierHistory::forget_known() {
-    known_until = -std::numeric_limits<double>::infinity();
+    known_until = -infinity;
     known_below = 0.0;
 }
 

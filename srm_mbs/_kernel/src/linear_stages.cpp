@@ -2,9 +2,9 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 
 #include "errors.hpp"
+#include "limits.hpp"
 #include "linear.hpp"
 
 namespace srm {
@@ -101,8 +101,7 @@ void LinearStages::linearise(double t, double h, const double* state,
     }
     std::fill(by_time_.begin(), by_time_.end(), 0.0);
     if (!system_.time_dependent()) return;
-    const double spacing =
-        std::nextafter(std::abs(t), std::numeric_limits<double>::infinity()) - std::abs(t);
+    const double spacing = std::nextafter(std::abs(t), infinity) - std::abs(t);
     const double tau = rounded_down(
         std::max(constants_.time_difference * h, constants_.shortest_difference * spacing));
     rate_at(t + tau, state, zone, probe_);

@@ -3,11 +3,11 @@
 #include <algorithm>
 #include <cmath>
 #include <functional>
-#include <limits>
 
 #include <Eigen/Cholesky>
 
 #include "errors.hpp"
+#include "limits.hpp"
 #include "linear.hpp"
 #include "workspace.hpp"
 
@@ -67,7 +67,7 @@ double close_loops(System& system, Algebra& algebra, const double* row_unit, con
     std::vector<double> at(nq + nv, 0.0), delta(2 * nv, 0.0), g(system.rows());
     std::vector<double> G(static_cast<std::size_t>(system.rows()) * nv);
     std::copy_n(q.begin(), nq, at.begin());
-    double error = std::numeric_limits<double>::infinity();
+    double error = infinity;
     for (int k = 1; k <= limits.evaluations; ++k) {
         system.closures_at(0.0, at.data(), g.data(), G.data(), nv);
         double size = 0.0, longest = 0.0;

@@ -2,12 +2,12 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 #include <utility>
 
 #include <Eigen/Cholesky>
 #include <Eigen/Eigenvalues>
 
+#include "limits.hpp"
 #include "linear.hpp"
 #include "workspace.hpp"
 
@@ -17,7 +17,7 @@ namespace srm {
 double System::scene_diagonal(double rounding) const {
     const auto& model = work_->model;
     const auto& work = *work_;
-    Eigen::Array3d least = Eigen::Array3d::Constant(std::numeric_limits<double>::infinity());
+    Eigen::Array3d least = Eigen::Array3d::Constant(infinity);
     Eigen::Array3d most = -least;
     double gyration = 0.0;
     const auto mark = [&](const Eigen::Vector3d& at) {
@@ -42,7 +42,6 @@ double System::scene_diagonal(double rounding) const {
 }
 
 Gyrations System::gyrations(double diagonal) const {
-    const double infinite = std::numeric_limits<double>::infinity();
     const auto& model = work_->model;
     std::vector<double> sizes(model.njoints);
     const auto reach = [&](int joint, const auto& at) {
@@ -56,12 +55,12 @@ Gyrations System::gyrations(double diagonal) const {
         reach(closure.joint_a, Eigen::Vector3d(closure.at_a.data()));
         reach(closure.joint_b, Eigen::Vector3d(closure.at_b.data()));
     }
-    Gyrations out{infinite, 0.0};
+    Gyrations out{infinity, 0.0};
     for (int i = 1; i < model.njoints; ++i) {
         const double mass = model.inertias[i].mass();
         const double half_trace = 0.5 * model.inertias[i].inertia().matrix().trace();
         if (mass == 0.0 && half_trace == 0.0) continue;
-        if (!(mass > 0.0 && half_trace >= 0.0)) return {0.0, infinite};
+        if (!(mass > 0.0 && half_trace >= 0.0)) return {0.0, infinity};
         const double gyration = std::sqrt(half_trace / mass);
         out.least = std::min(out.least, gyration / sizes[i]);
         out.largest = std::max(out.largest, gyration / diagonal);

@@ -3,10 +3,10 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 #include <utility>
 
 #include "constants.hpp"
+#include "limits.hpp"
 
 namespace srm {
 
@@ -16,7 +16,7 @@ namespace srm {
 inline double late_past_layer(double h, double before, double after,
                               std::pair<double, double> stages, double speed, double tolerance,
                               const Constants& constants) {
-    constexpr double none = -std::numeric_limits<double>::infinity();
+    constexpr double none = -infinity;
     const double layer = constants.friction_layer * speed;
     const double far = constants.layer_landing * layer, target = 0.5 * (layer + far);
     const double size = std::abs(before);

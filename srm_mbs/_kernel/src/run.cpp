@@ -8,13 +8,13 @@
 #include "critical.hpp"
 #include "errors.hpp"
 #include "interpreter.hpp"
+#include "limits.hpp"
 #include "linear.hpp"
 #include "reversals.hpp"
 
 namespace srm {
 
 namespace {
-constexpr double inf = std::numeric_limits<double>::infinity();
 // Attempts between two looks at the clock.
 constexpr long clock_every = 16;
 // Steps that records have room for at first, and the largest room for their rates (numbers).
@@ -233,7 +233,7 @@ Stop Run::attempt(StepDecision& decision) {
         const bool due = !known_ && zero > t_ && memory.sigma < examine_below_;
         if (due && (one_freedom_ || !quiet_) && examine(zero)) return make_prepared();
     }
-    const double spacing = std::nextafter(std::abs(t_), inf) - std::abs(t_);
+    const double spacing = std::nextafter(std::abs(t_), infinity) - std::abs(t_);
     if (!(h > std::max(smallest_, 4.0 * spacing))) return Stop::too_short;
     const int steps = constants().standstill_steps;
     if (made_ >= steps && made_ % steps == 0 &&
@@ -258,7 +258,7 @@ Stop Run::attempt(StepDecision& decision) {
     const int placement = redone_ ? 2 : proposal.placed ? 1 : 0;
     redone_ = decision == StepDecision::replaced;
     if (decision != StepDecision::accepted || !result) {
-        attempts.push_back({t_, h, result ? result->error_ratio : inf, decision});
+        attempts.push_back({t_, h, result ? result->error_ratio : infinity, decision});
         const bool stuck = !control->adaptive && decision == StepDecision::rejected;
         return stuck ? Stop::evaluation : Stop::chunk;
     }
@@ -267,14 +267,14 @@ Stop Run::attempt(StepDecision& decision) {
     // Where sigma rises, the next passage is another one.
     if (result->sigmas.back() > result->sigmas.front()) {
         known_ = false;
-        examine_below_ = inf;
+        examine_below_ = infinity;
     }
     if (leaves_closures_open(*result)) return Stop::closures;
     if (result->in_zone)
         records.zones.push_back({records.count(), result->zone_threshold, *memory.history});
     record(*result, proposal.t_new, placement);
     const bool jumped = on_jump_;
-    jump_limit_ = inf;
+    jump_limit_ = infinity;
     jump_tries_ = 0;
     on_jump_ = false;
     inaccurate_ = jumped && t_ < interval_end() && !restart_after_break();
@@ -283,7 +283,7 @@ Stop Run::attempt(StepDecision& decision) {
 
 // ReversalSearch.late in integration/reversals.py.
 double Run::late_past_layers(const StepResult& r) const {
-    double late = -inf;
+    double late = -infinity;
     for (const FrictionSum& sum : system.friction_sums()) {
         double tolerance = 0.0;
         for (std::size_t k = 0; k < sum.columns.size(); ++k) {
@@ -291,7 +291,7 @@ double Run::late_past_layers(const StepResult& r) const {
             const double scale = std::max(memory.state_scale[i], r.state_scale[i]);
             tolerance += std::abs(sum.coefficients[k]) * step.norm.weight(i, scale);
         }
-        std::pair<double, double> stages(inf, -inf);
+        std::pair<double, double> stages(infinity, -infinity);
         const std::size_t width = 2 * system.nv;
         for (std::size_t at = 0; at + width < r.rates.size(); at += width) {
             const double rate = sum.of(&r.rates[at]);
@@ -309,7 +309,7 @@ bool Run::misses_jump(const Proposal& proposal, const StepResult& r) {
     const double h = proposal.h;
     double late = system.past_jump(proposal.t_new, r.state.data());
     on_jump_ = late == 0.0;
-    const double turned = control->adaptive ? late_past_layers(r) : -inf;
+    const double turned = control->adaptive ? late_past_layers(r) : -infinity;
     if (control->adaptive && !(r.error_ratio <= 1.0) && !(turned > 0.0)) return false;
     late = std::max(late, turned);
     const bool is_short = h == jump_limit_ && -h < late && late < 0.0;
@@ -409,7 +409,7 @@ Stop Run::make_prepared() {
     record(step.result, t, StepRecords::critical);
     if (prepared_.empty()) {
         known_ = quiet_ = false;
-        examine_below_ = inf;
+        examine_below_ = infinity;
         control->moved(t_);
     }
     return t_ < t_end() ? Stop::chunk : Stop::finished;

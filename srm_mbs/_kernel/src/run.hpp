@@ -1,7 +1,6 @@
 // The driver: propose a step, make it, decide on it, record it; in chunks.  See driver.py.
 #pragma once
 
-#include <limits>
 #include <memory>
 #include <optional>
 #include <string>
@@ -10,6 +9,7 @@
 
 #include "control.hpp"
 #include "large_array.hpp"
+#include "limits.hpp"
 #include "passage.hpp"
 #include "struct_fields.hpp"
 
@@ -203,7 +203,7 @@ private:
     long made_ = 0;  // steps, whether their records are still here or not
     double watched_time_ = 0.0;
     // The search for the end of a step on a jump of forces: JumpSearch in driver.py.
-    double jump_limit_ = std::numeric_limits<double>::infinity();
+    double jump_limit_ = infinity;
     int jump_tries_ = 0;
     bool on_jump_ = false;
     bool inaccurate_ = false;  // the first stage after a jump: Python has to look at it
@@ -214,7 +214,7 @@ private:
     bool known_ = false;      // the passage ahead has been examined
     bool quiet_ = false;      // the last step was
     // sigma below which the motion is examined again, where no passage was found so far.
-    double examine_below_ = std::numeric_limits<double>::infinity();
+    double examine_below_ = infinity;
     // Steps along a curve that are still to be made, the next one last, and their ends.
     std::vector<std::pair<StepResult, double>> prepared_;
     std::optional<MotionAlongCurve> passage_;  // one that is under way

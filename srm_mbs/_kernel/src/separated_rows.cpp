@@ -1,7 +1,8 @@
 #include "separated_rows.hpp"
 
 #include <cmath>
-#include <limits>
+
+#include "limits.hpp"
 
 namespace srm {
 
@@ -48,7 +49,7 @@ double SeparatedRows::smallest(System& system, Algebra& algebra, double t, const
         }
         // Active rows may vanish somewhere: they stay rows of the algebra.
         if (!used && std::sqrt(squares) > inert)
-            return std::numeric_limits<double>::quiet_NaN();
+            return not_a_number;
         next += used;
     }
     return algebra.smallest_of_rows();

@@ -2,15 +2,14 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 
+#include "limits.hpp"
 #include "linear.hpp"
 
 namespace srm {
 
 namespace {
 
-constexpr double infinity = std::numeric_limits<double>::infinity();
 
 // The largest of each value and its neighbours, as far as there are any.  Two windows make one of
 // the double width, up to the last power of 2; then two overlap.

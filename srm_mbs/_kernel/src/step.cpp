@@ -6,6 +6,7 @@
 #include <utility>
 
 #include "errors.hpp"
+#include "limits.hpp"
 #include "linear.hpp"
 
 namespace srm {
@@ -173,7 +174,7 @@ double SplitStep::stiffness() const {
     for (int i = nv_; i < n; ++i) change[i] = last[i] - other[i];
     const double dq = system_.position_norm(apart_.data());
     const double dv = system_.position_norm(&apart_[nv_]);
-    if (!(dq > 0.0 && dv > 0.0)) return std::numeric_limits<double>::quiet_NaN();
+    if (!(dq > 0.0 && dv > 0.0)) return not_a_number;
     const double da = system_.position_norm(change + nv_);
     return h_ * std::min(da / dv, std::sqrt(da / dq));
 }
@@ -408,7 +409,7 @@ void SplitStep::add_rounding(double sigma_change) {
     // Below the threshold of the zone no multiplier is solved for directly.
     double least = branch_.zone.history ? branch_.zone.threshold : 0.0;
     if (noded_) least = std::max(least, constants.branch_below);
-    double lowest = std::numeric_limits<double>::infinity();
+    double lowest = infinity;
     for (int j = 1; j <= scheme.stages(); ++j)
         if (result.sigmas[j] >= least) lowest = std::min(lowest, result.sigmas[j]);
     lowest = std::max(lowest, branch_.inaccurate_below);

@@ -12,6 +12,7 @@
 #include <pinocchio/algorithm/rnea.hpp>
 
 #include "errors.hpp"
+#include "limits.hpp"
 #include "linear.hpp"
 #include "terms.hpp"
 #include "workspace.hpp"
@@ -272,7 +273,7 @@ Pattern System::pattern() const {
 }
 
 double System::sigma() const {
-    return closed_ ? projection_->sigma : std::numeric_limits<double>::infinity();
+    return closed_ ? projection_->sigma : infinity;
 }
 int System::rank() const { return closed_ ? projection_->rank : 0; }
 bool System::rank_deficient() const { return closed_ && projection_->rank_deficient; }
@@ -492,7 +493,7 @@ void System::restart() {
     track_laws(false);
     held_from_.clear();
     held_.clear();
-    between(-std::numeric_limits<double>::infinity(), std::numeric_limits<double>::infinity());
+    between(-infinity, infinity);
     evaluations = 0;
     if (closed_) projection_->factorisations = 0;
 }
@@ -1389,8 +1390,7 @@ double System::step_limit(const double* state) const {
     double speed = 0.0;
     for (const GroupJoint& joint : data_.groups)
         speed = std::max(speed, joint.rotation(state + nq));
-    return speed > 0.0 ? data_.rotation_per_step / speed
-                       : std::numeric_limits<double>::infinity();
+    return speed > 0.0 ? data_.rotation_per_step / speed : infinity;
 }
 
 void System::move_bodies(const double* state) {
@@ -1409,7 +1409,7 @@ void System::begin_step(double t, const double* state) {
 }
 
 double System::past_jump(double t, const double* state) {
-    double out = -std::numeric_limits<double>::infinity();
+    double out = -infinity;
     if (bushings_.empty()) return out;
     move_bodies(state);
     for (BushingStep& bushing : bushings_)

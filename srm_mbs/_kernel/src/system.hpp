@@ -10,7 +10,6 @@
 
 #include <array>
 #include <functional>
-#include <limits>
 #include <memory>
 #include <string>
 #include <vector>
@@ -21,6 +20,7 @@
 #include "generated.hpp"
 #include "generated_projection.hpp"
 #include "history.hpp"
+#include "limits.hpp"
 #include "projection.hpp"
 #include "struct_fields.hpp"
 #include "vectors.hpp"
@@ -412,8 +412,8 @@ private:
     void joined_laws_by_state(const double* state, const double* a, double* out);
     void controller_by_state(double t, const double* state, const std::vector<double>& steps);
 
-    double first_ = -std::numeric_limits<double>::infinity();  // times (s) within which it evaluates
-    double last_ = std::numeric_limits<double>::infinity();
+    double first_ = -infinity;  // times (s) within which it evaluates
+    double last_ = infinity;
     const GeneratedTerms* code_ = nullptr;
     std::unique_ptr<Projection> other_projection_;  // that with generated algebra, or without it
     GeneratedProjection* by_code_ = nullptr;        // the one in use, if its algebra is generated

@@ -2,8 +2,8 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 
+#include "limits.hpp"
 #include "linear.hpp"
 
 namespace srm {
@@ -172,7 +172,7 @@ bool TouchingBranch::prepare(double t, const double* state, const Vector& frame)
 
 // The node at x, by Newton's method from the parabola moved by node.off; whether it found it.
 bool TouchingBranch::find(double t, double x, Node& node) {
-    double last = std::numeric_limits<double>::infinity();
+    double last = infinity;
     Vector closing(nv_), basis, rates, gram(f_ * f_), column(f_);
     std::vector<int> pivots(f_);
     for (int iteration = 0; iteration < constants_.node_iterations; ++iteration) {

@@ -21,7 +21,8 @@ from srm_mbs.dynamics.scaling import angle_coordinates, start_rounding
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.psrm import is_split
 from srm_mbs.model.mechanism import MechanismData, per_model
-from srm_mbs.simulation.options import positive, tightest_rtol
+from srm_mbs.model.numbers import positive_number
+from srm_mbs.simulation.options import tightest_rtol
 from srm_mbs.simulation.rerun import rerun
 from srm_mbs.simulation.result import SimulationResult
 
@@ -222,9 +223,8 @@ def checked_settings(solution: SimulationResult, rtol: float | None) -> list[flo
     # By default no tolerance is so tight that rounding dominates.
     rounding = start_rounding(solution.mechanism).relative
     tightest = max(tightest_rtol(solution.scheme, True), rounding)
-    other = (
-        max(TIGHTEST_RATIO * settings.rtol, tightest) if rtol is None else positive(rtol, "rtol")
-    )
+    tighter = max(TIGHTEST_RATIO * settings.rtol, tightest)
+    other = tighter if rtol is None else positive_number(rtol, "rtol")
     if rtol is None and settings.rtol < INTERMEDIATE_RATIO * tightest:
         other = INTERMEDIATE_RATIO * settings.rtol  # a looser run gives a bound
     ratio = max(other / settings.rtol, settings.rtol / other)
@@ -232,7 +232,7 @@ def checked_settings(solution: SimulationResult, rtol: float | None) -> list[flo
         raise InputError(
             f"rtol = {other:g} is that of the run: two equal runs show no error",
             element="rtol",
-            remedy=f"Give for example rtol={max(TIGHTEST_RATIO * settings.rtol, tightest):g}",
+            remedy=f"Give for example rtol={tighter:g}",
         )
     between = [math.sqrt(other * settings.rtol)] * (ratio > INTERMEDIATE_RATIO)
     return sorted([other, *between], reverse=True)
@@ -242,7 +242,7 @@ def estimate_error(
     solution: SimulationResult,
     settings: list[float],
     samples: Sequence[Samples],
-    progress: Any = False,
+    progress: Any,
 ) -> ErrorEstimate | str:
     """Repeat ``solution`` at each of ``settings``, and compare; or the reason why that failed.
 

@@ -21,7 +21,7 @@ from srm_mbs.analysis.report.sections import (
     pictures_data,
     run_data,
 )
-from srm_mbs.errors import InputError, __version__, safe_repr
+from srm_mbs.errors import InputError, __version__, known_names, safe_repr
 from srm_mbs.formats.files import checked_path, utf8
 from srm_mbs.model.numbers import flag, name_list
 from srm_mbs.simulation.result import SimulationResult
@@ -92,7 +92,7 @@ def write_report(
             raise InputError(
                 f"reports have no picture of the kind {safe_repr(kind)}",
                 element="pictures",
-                remedy=f"Known: {', '.join(PICTURES)}",
+                remedy=known_names(PICTURES),
             )
     if certificate is None:
         certificate = certify(solution, rtol=rtol, again=again, progress=progress)
@@ -107,7 +107,7 @@ def report_page(
     certificate: Certificate,
     *,
     animation: bool = True,
-    pictures: Sequence[str] = tuple(PICTURES),
+    pictures: Sequence[str],
     full_paths: bool = False,
 ) -> str:
     """The page of :func:`write_report`."""

@@ -124,7 +124,7 @@ def _about(mechanism: Mechanism, text: object, full_paths: bool) -> str:
     return str(text) if full_paths or source is None else source.without_folders(str(text))
 
 
-def mechanism_data(solution: SimulationResult, full_paths: bool = False) -> dict[str, Any]:
+def mechanism_data(solution: SimulationResult, full_paths: bool) -> dict[str, Any]:
     """Snapshot, provenance, joints, bodies, loops, forces and drives."""
     mechanism = solution.mechanism
     model = mechanism.model

@@ -8,7 +8,7 @@ from functools import lru_cache
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple, Self
 
-from srm_mbs.errors import InputError, known_names, naming
+from srm_mbs.errors import InputError, counted, known_names, naming
 from srm_mbs.formats.files import check_name
 from srm_mbs.formats.graph.joint_graph import ROOT_JOINT
 from srm_mbs.formats.planar.shapes import (
@@ -230,7 +230,8 @@ class Drawing:
     def _check_bar(self, bar: PlanarBar) -> None:
         element = f"bar {bar.name!r}"
         if len(bar.points) < 2:
-            raise fault(element, f"it has {len(bar.points)} points", "Give two points or more")
+            found = counted(len(bar.points), "point")
+            raise fault(element, f"it has {found}", "Give two points or more")
         for name in bar.points:
             self.point(name, element)
             if bar.points.count(name) > 1:

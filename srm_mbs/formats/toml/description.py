@@ -15,7 +15,7 @@ from typing import Any, Self, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from srm_mbs.errors import InputError, naming
+from srm_mbs.errors import InputError, known_names, naming
 from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.files import check_name, shortened
 from srm_mbs.formats.toml.schema import (
@@ -216,7 +216,7 @@ def _law(entry: Mapping[str, Any], tables: CsvFolder) -> Law:
     if kind is None:
         raise InputError(
             f"there is no law of type {entry['type']!r}",
-            remedy=f"Known: {', '.join(LAW_TYPES)}",
+            remedy=known_names(LAW_TYPES),
         )
     given = {key: value for key, value in entry.items() if key != "type" and value is not None}
     keys = fields(kind)  # type: ignore[arg-type]
@@ -225,7 +225,7 @@ def _law(entry: Mapping[str, Any], tables: CsvFolder) -> Law:
         if key not in accepted:
             raise InputError(
                 f"a law of type {kind.type!r} takes no {key}",
-                remedy=f"Known: {', '.join(accepted)}",
+                remedy=known_names(accepted),
             )
     if kind is Table and "table" in given:
         if "t" in given or "values" in given:
@@ -337,7 +337,8 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
         raise InputError(
             f"this is not valid TOML: {_without_quotes(error)}",
             file=file,
-            remedy="Correct it there; text stands in quotes, lists in [ ]",
+            remedy="Correct it there; text stands in quotes, as keys with blanks or accents do, "
+            "lists in [ ]",
         ) from error
     with naming(file=file):
         _check_texts(entries)
@@ -407,7 +408,7 @@ def check_description(entries: Mapping[str, Any], file: str) -> Description:
                 f"there is no closure type {entry.type!r}",
                 file=file,
                 element=f"loop[{i}].type",
-                remedy=f"Known: {', '.join(CLOSURE_TYPES)}",
+                remedy=known_names(CLOSURE_TYPES),
             )
         for side in "ab":
             if side in CLOSURE_TYPES[entry.type].needs and getattr(entry, side) is None:
@@ -445,10 +446,10 @@ def _explain(error: ValidationError) -> tuple[str, str, str]:
         name = str(location[-1])
         return key, f"unknown key {name!r}", f"Known: {_known_keys(first['loc'])}"
     if first["type"] == "union_tag_not_found":
-        return f"{key}.type", "this key is missing", f"Known: {', '.join(FORCE_TYPES)}"
+        return f"{key}.type", "this key is missing", known_names(FORCE_TYPES)
     if first["type"] == "union_tag_invalid":
         tag = first["input"]["type"]
-        known = f"Known: {', '.join(FORCE_TYPES)}"
+        known = known_names(FORCE_TYPES)
         return f"{key}.type", f"there is no force type {_shortened(tag)}", known
     if first["type"] == "missing":
         return key, "this key is missing", "Add it"

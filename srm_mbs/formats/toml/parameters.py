@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel
 
-from srm_mbs.errors import InputError, known_names, safe_repr
+from srm_mbs.errors import InputError, counted, known_names, safe_repr
 from srm_mbs.formats.files import shortened
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE, finite_number, named_values
@@ -285,7 +285,7 @@ class _Parameters:
         if not least <= len(arguments) <= most:
             wanted = f"{least}" if least == most else f"at least {least}"
             raise InputError(
-                f"in {_quoted(text)} the function {name} has {len(arguments)} arguments",
+                f"in {_quoted(text)} the function {name} has {counted(len(arguments), 'argument')}",
                 element=key,
                 remedy=f"Give it {wanted}",
             )

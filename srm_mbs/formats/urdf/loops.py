@@ -176,7 +176,7 @@ def _cut_second_parents(
     reader: LoopElements,
     options: Options,
     notes: list[str],
-    held: Sequence[str] = (),
+    held: Sequence[str],
 ) -> bool:
     """Remove the joints that close loops and add their closures to ``reader``; whether there were
     any.

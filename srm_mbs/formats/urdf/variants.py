@@ -20,6 +20,7 @@ from srm_mbs.errors import InputError
 from srm_mbs.formats.graph.joint_graph import inertia_tensor
 from srm_mbs.formats.toml.parameters import Nested, with_numbers
 from srm_mbs.formats.toml.schema import OverrideEntry
+from srm_mbs.formats.urdf.graph import link_of
 from srm_mbs.formats.urdf.override import TENSOR, changed_inertial, changed_place
 from srm_mbs.formats.urdf.validation import ElementChecker, doubtful_moments
 from srm_mbs.model.numbers import LARGEST_MAGNITUDE
@@ -107,7 +108,7 @@ class OverridableTree:
         checker = ElementChecker(file)
         nodes = {node.get("name", ""): node for node in root.findall("joint")}
         bodies = {node.get("name", ""): node for node in root.findall("link")}
-        carriers = {_link(node, "child"): name for name, node in nodes.items()}
+        carriers = {link_of(node, "child"): name for name, node in nodes.items()}
         if any(node.get("type") == "fixed" for node in nodes.values()):
             return None
         joints: dict[str, list[float]] = {}
@@ -165,9 +166,3 @@ class OverridableTree:
             return None
         moved = {joint: place.translation for joint, place in places.items()}
         return model_with(known, moved, inertias)
-
-
-def _link(joint: Element, tag: str) -> str:
-    """The link that the element ``tag`` of a joint names."""
-    node = joint.find(tag)
-    return "" if node is None else node.get("link", "")

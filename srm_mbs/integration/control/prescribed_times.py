@@ -64,7 +64,7 @@ class AvoidTimes(ControlWrapper):
         scheme: ButcherTableau,
         times: FloatArray,
         t_end: float,
-        step: float | None = None,
+        step: float | None,
     ) -> None:
         super().__init__(inner, t_end)
         self._step = step

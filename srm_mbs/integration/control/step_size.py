@@ -260,7 +260,7 @@ class FixedStep:
         target = self._t0 + self._index * self._step
         if target > self._t_end - 1e-9 * self._step:
             target = self._t_end
-        if limit < target - t:
+        if limit < target - t - self._sliver():
             return Proposal.over(t, limit)
         return Proposal(target - t, target)
 

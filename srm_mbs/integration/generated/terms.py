@@ -861,7 +861,7 @@ class RecordedTerms(NamedTuple):
     along_v: list[Direction]
 
 
-def record_terms(structure: Structure, frame: int = GROUND) -> RecordedTerms:
+def record_terms(structure: Structure, frame: int) -> RecordedTerms:
     """The terms of ``structure``, recorded in the frame of this body.
 
     ``frame`` is the number of a motion or GROUND, in whose frame bushings take their bodies.

@@ -11,12 +11,13 @@ from functools import cache
 from srm_mbs._kernel import core, missing, remedy
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import InputError, get_logger, safe_repr, warn
+from srm_mbs.errors import InputError, get_logger, known_names, safe_repr, warn
 from srm_mbs.integration.generated.code import source_of_structure, structure_of_mechanism
 from srm_mbs.integration.generated.code_cache import compiler
 from srm_mbs.integration.generated.policy import code_at_hand, compile_seconds
 from srm_mbs.integration.methods.base import Method
 from srm_mbs.integration.methods.psrm import is_split
+from srm_mbs.model.numbers import choice
 
 log = get_logger(__name__)
 
@@ -62,7 +63,7 @@ def _of_environment() -> str:
         raise InputError(
             f"the environment variable SRM_MBS_BACKEND = {safe_repr(asked)} names no backend",
             element="backend",
-            remedy=f"Known: {', '.join(BACKENDS)}",
+            remedy=known_names(BACKENDS),
         )
     return asked
 
@@ -142,12 +143,7 @@ def chosen_backend(asked: str, method: Method, placement: str, singular_times: F
     InputError
         If there is no such backend, or ``asked`` needs the kernel and it cannot make the run.
     """
-    if not isinstance(asked, str) or asked not in BACKENDS:
-        raise InputError(
-            f"there is no backend {safe_repr(asked)}",
-            element="backend",
-            remedy=f"Known: {', '.join(BACKENDS)}",
-        )
+    choice(asked, BACKENDS, "backend")
     wanted = _of_environment() if asked == "auto" else asked
     if wanted == "python":
         return "python"

@@ -420,7 +420,7 @@ _STEP_ARRAYS = ("times", "states", "rates", "corrections", "sigmas", "end_rate",
 
 
 def steps_struct(steps: StepData) -> Any:
-    """``StepArrays`` of module.cpp, which refers to the arrays of ``steps``."""
+    """``StepArrays`` of bind_dense_output.cpp, which refers to the arrays of ``steps``."""
     return _core.StepArrays(
         **{name: getattr(steps, name) for name in _STEP_ARRAYS},
         break_rates=steps.break_rates.reshape(len(steps.breaks), len(steps.end_rate)),

@@ -19,10 +19,11 @@ from srm_mbs.integration.methods.thesis.iterated_sweeps import First, IteratedSw
 from srm_mbs.integration.methods.thesis.regularisation import Regularisation, parse_eps
 from srm_mbs.integration.methods.thesis.sweep import (
     INTERPOLATIONS,
-    checked_regulariser,
+    REGULARISERS,
     interpolant,
 )
 from srm_mbs.model.lazy import cached_property
+from srm_mbs.model.numbers import choice
 
 _FORMS = {"exact": ("split", "sweep", "fused"), "simple": ("sweep",)}
 """Corrections of each prediction, the default first."""
@@ -108,7 +109,7 @@ class PSRM(DelegatingMethod):
                 remedy='Use prediction="exact" with correction="split", "sweep" or "fused", or '
                 'prediction="simple" with correction="sweep"',
             )
-        checked_regulariser(self.T)
+        choice(self.T, REGULARISERS, "T")
         if self.correction != "split":
             if self.tableau == "auto":
                 object.__setattr__(self, "tableau", "dop853")

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.errors import InputError
 from srm_mbs.integration.methods import dop853_coefficients, rodas5p_coefficients
 from srm_mbs.integration.methods.butcher import (
     ButcherTableau,
@@ -27,6 +27,7 @@ from srm_mbs.integration.methods.butcher import (
     ExactRow,
     ExactTableau,
 )
+from srm_mbs.model.numbers import choice
 
 
 def get_tableau(name: str | ButcherTableau) -> ButcherTableau:
@@ -39,14 +40,7 @@ def get_tableau(name: str | ButcherTableau) -> ButcherTableau:
     """
     if isinstance(name, ButcherTableau):
         return name
-    tableau = TABLEAUS.get(name) if isinstance(name, str) else None
-    if tableau is None:
-        raise InputError(
-            f"there is no tableau {safe_repr(name)}",
-            element="tableau",
-            remedy=f"Known: {', '.join(TABLEAUS)}",
-        )
-    return tableau
+    return TABLEAUS[choice(name, TABLEAUS, "tableau")]
 
 
 def check_explicit(scheme: ButcherTableau) -> None:

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.scaling import is_angle
-from srm_mbs.model.coordinates import position_of
+from srm_mbs.dynamics.scaling import is_angle, joint_track
 
 
 @dataclass(frozen=True)
@@ -87,5 +84,4 @@ class CrankPositions:
 
     def track(self, joint: str) -> FloatArray:
         """Positions (n,) of a joint of one degree of freedom, rad (unwrapped) or m."""
-        found = np.array([position_of(self.mechanism, q, joint) for q in self.q])
-        return np.unwrap(found) if is_angle(self.mechanism.model, joint) else found
+        return joint_track(self.mechanism, self.q, joint)

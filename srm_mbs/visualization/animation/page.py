@@ -18,7 +18,7 @@ import pinocchio as pin
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import is_angle, row_dimensions
-from srm_mbs.errors import CHECK_WRITING, InputError, get_logger
+from srm_mbs.errors import get_logger, unwritable
 from srm_mbs.formats.files import write_bytes
 from srm_mbs.integration.singular_passages import Crossing
 from srm_mbs.simulation.result import SimulationResult
@@ -405,7 +405,5 @@ def write_file(path: Path, content: bytes) -> None:
     try:
         write_bytes(path, content)
     except OSError as error:
-        raise InputError(
-            f"it cannot be written: {error.strerror}", file=str(path), remedy=CHECK_WRITING
-        ) from error
+        raise unwritable(path, error) from error
     log.info("written: %s", path)

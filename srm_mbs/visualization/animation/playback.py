@@ -7,7 +7,6 @@ so that the browser plays the motion in real time and its time slider scrubs thr
 from __future__ import annotations
 
 import atexit
-import math
 import sys
 import time
 import webbrowser
@@ -16,7 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from srm_mbs.errors import InputError, get_logger, safe_repr
+from srm_mbs.errors import get_logger
+from srm_mbs.model.numbers import positive_integer, positive_number
 from srm_mbs.visualization.animation.meshcat_scene import draw_picture, import_meshcat
 from srm_mbs.visualization.animation.overlays import NO_OVERLAYS, ViewOptions
 from srm_mbs.visualization.animation.page import (
@@ -46,17 +46,7 @@ def check_fps(fps: Any) -> float:
     InputError
         If ``fps`` is not a positive number.
     """
-    try:
-        value = float(fps)
-    except (TypeError, ValueError):
-        value = math.nan
-    if not (math.isfinite(value) and value > 0.0):
-        raise InputError(
-            f"fps = {safe_repr(fps)} is not a positive number of key frames per second",
-            element="fps",
-            remedy="Give for example fps=60",
-        )
-    return value
+    return positive_number(fps, "fps", " of key frames per second", "Give for example fps=60")
 
 
 _open_visualizers: list[Any] = []
@@ -270,10 +260,10 @@ class Embedded:
 def show_in_notebook(
     solution: DrawableMotion,
     *,
-    height: int = 420,
-    fps: float = 60.0,
-    view: ViewOptions = NO_OVERLAYS,
-    panel: bool = True,
+    height: int,
+    fps: float,
+    view: ViewOptions,
+    panel: bool,
 ) -> Embedded:
     """The animation of a run as the value of a notebook cell.
 
@@ -292,11 +282,6 @@ def show_in_notebook(
         If ``height`` is not a positive whole number, or as for
         :func:`srm_mbs.visualization.animation.playback.export_html`.
     """
-    if not isinstance(height, int) or height <= 0:
-        raise InputError(
-            f"height = {safe_repr(height)} is not a positive whole number of pixels",
-            element="height",
-            remedy="Give for example height=420",
-        )
+    height = positive_integer(height, "height", "Give for example height=420", " of pixels")
     page = page_of(solution, fps, view, panel=panel)
     return Embedded(page, height)

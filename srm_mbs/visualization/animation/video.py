@@ -22,8 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, safe_repr
+from srm_mbs.errors import CHECK_WRITING, InputError, get_logger, safe_repr, unwritable
 from srm_mbs.formats.files import whole_file
+from srm_mbs.integration.dense_output import checked_time
+from srm_mbs.model.numbers import positive_number
 from srm_mbs.simulation.monitoring import Counted, counting
 from srm_mbs.simulation.options import check_progress
 from srm_mbs.visualization.animation.overlays import ViewOptions
@@ -302,13 +304,7 @@ def export_image(
             f"pictures are PNG files, not {path.suffix!r}", file=str(path), remedy="Name it .png"
         )
     start, end = solution.span
-    t = end if t is None else t
-    if not start <= t <= end:
-        raise InputError(
-            f"t = {safe_repr(t)} lies outside the run, from {start:g} to {end:g} s",
-            element="t",
-            remedy="Give a time of the run",
-        )
+    t = end if t is None else checked_time(t, start, end, "t")
     pixels, density = image_pixels(size, dpi)
     with photographer(solution, pixels, 60.0, view, [t]) as photograph:
         picture = photograph(t)
@@ -449,12 +445,7 @@ def export_video(
             element="path",
             remedy="Name it .gif or .mp4, or without a suffix a folder",
         )
-    if not (math.isfinite(speed) and speed > 0.0):
-        raise InputError(
-            f"speed = {safe_repr(speed)} is not a positive number",
-            element="speed",
-            remedy="Give a positive number: 1 is real time",
-        )
+    speed = positive_number(speed, "speed", remedy="Give a positive number: 1 is real time")
     encoder = encoder_of(path) if kind else None
     start, end = solution.span
     count = max(1, math.floor((end - start) / speed * fps * (1.0 + 1e-12)) + 1)
@@ -507,9 +498,7 @@ def _write_frames(folder: Path, pictures: Iterable[bytes]) -> None:
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise InputError(
-            f"it cannot be written: {error.strerror}", file=str(folder), remedy=CHECK_WRITING
-        ) from error
+        raise unwritable(folder, error) from error
     for number, picture in enumerate(pictures, 1):
         write_file(folder / FRAME.format(number), picture)
 
@@ -584,7 +573,5 @@ def _encode(encoder: str, pictures: Sequence[bytes], fps: float, path: Path) -> 
                     remedy="Write a .gif, which needs no encoder",
                 )
     except OSError as error:
-        raise InputError(
-            f"it cannot be written: {error.strerror}", file=str(path), remedy=CHECK_WRITING
-        ) from error
+        raise unwritable(path, error) from error
     log.info("written: %s", path)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.errors import InputError, known_names, safe_repr
 from srm_mbs.formats.files import checked_path
 from srm_mbs.visualization.plotting.dae import draw_dae_run, draw_dae_state
 from srm_mbs.visualization.plotting.energy import draw_balance
@@ -65,7 +65,7 @@ DAE_KINDS: Kinds = {"run": draw_dae_run, "state": draw_dae_state}
 """Kinds of plots of a run of a DAE."""
 
 
-def check_options(kind: str, options: Iterable[str] = (), kinds: Kinds = KINDS) -> None:
+def check_options(kind: str, options: Iterable[str], kinds: Kinds = KINDS) -> None:
     """Refuse an unknown kind of plot, or options that it does not have.
 
     Raises
@@ -77,7 +77,7 @@ def check_options(kind: str, options: Iterable[str] = (), kinds: Kinds = KINDS) 
         raise InputError(
             f"there is no kind of picture {safe_repr(kind)}",
             element="kind",
-            remedy=f"Known: {', '.join(kinds)}",
+            remedy=known_names(kinds),
         )
     _, *known = inspect.signature(kinds[kind]).parameters
     known += COMMON
@@ -86,7 +86,7 @@ def check_options(kind: str, options: Iterable[str] = (), kinds: Kinds = KINDS) 
             raise InputError(
                 f"a picture of kind {safe_repr(kind)} has no such option",
                 element=name,
-                remedy=f"Known: {', '.join(known)}",
+                remedy=known_names(known),
             )
 
 

@@ -130,7 +130,7 @@ def check_suffix(path: Path) -> None:
         raise InputError(
             f"figures cannot be saved as {path.suffix!r}",
             file=str(path),
-            remedy=f"Known: {', '.join(FORMATS)}",
+            remedy=known_names(FORMATS),
         )
 
 

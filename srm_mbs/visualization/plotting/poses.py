@@ -23,6 +23,7 @@ from srm_mbs.dynamics.constraints.wrenches import Placements
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import is_angle
 from srm_mbs.errors import InputError, known_names, safe_repr
+from srm_mbs.integration.dense_output import checked_time
 from srm_mbs.model.anchors import Anchor, one_degree_joint
 from srm_mbs.model.numbers import finite_array
 from srm_mbs.simulation.result import SimulationResult
@@ -229,14 +230,7 @@ def _times(solution: SimulationResult, at: Any, crank: str | None) -> FloatArray
         )
     if crank is not None:
         return np.unique(_times_of(solution, crank, given))
-    for t in given:
-        if not start <= t <= end:
-            raise InputError(
-                f"{t:g} s lies outside the run, from {start:g} to {end:g} s",
-                element="at",
-                remedy="Give times of the run",
-            )
-    return np.unique(given)
+    return np.unique([checked_time(t, start, end, "at") for t in given])
 
 
 def _times_of(solution: SimulationResult, crank: str, values: FloatArray) -> FloatArray:

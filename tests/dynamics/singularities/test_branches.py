@@ -10,18 +10,12 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
-from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
-from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.singularities.branches import branch_tangents
-from srm_mbs.dynamics.singularities.local_analysis import (
-    SingularConfiguration,
-    analyse_singular,
-    nearest_singular,
-)
 from srm_mbs.integration.singular_passages import find_crossings
 from tests.support import reduced
 from tests.support.mechanisms import ball_dead_point, floating_slider_crank
+from tests.support.singularities import singular_at
 
 PI = np.pi
 
@@ -44,14 +38,6 @@ def test_the_crank_passes_its_spatial_dead_points_on_its_branch(
 
 
 # --- tangents -----------------------------------------------------------------------------------
-
-
-def singular_at(mechanism: Mechanism, q: Any) -> SingularConfiguration:
-    geometry = ClosureGeometry(mechanism, mechanism.q0)
-    rank = mechanism.structure.rank
-    found = nearest_singular(geometry, np.asarray(q, dtype=float), rank, reach=0.3)
-    assert found is not None
-    return analyse_singular(geometry, found, rank)
 
 
 def test_the_tangents_of_a_slider_crank_are_its_two_motions() -> None:
@@ -158,7 +144,8 @@ class Joined:
             self.first(t) if t < self.at else self.second(min(t - self.at, self.second.t[-1]))
             for t in times
         ]
-        return np.array([np.concatenate(state) for state in states])
+        rows = [np.concatenate(state) for state in states]
+        return np.reshape(rows, (len(times), self.steps.states.shape[1]))
 
 
 @pytest.mark.parametrize(("ratio", "switched"), [(-2.0, False), (0.0, True)])

@@ -74,12 +74,6 @@ def files(
     return path
 
 
-@pytest.fixture(autouse=True)
-def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """MuJoCo writes its warnings to a file where it runs."""
-    monkeypatch.chdir(tmp_path)
-
-
 CASES = {
     "body": ('<attach model="limb" body="upper" prefix="a-"/>', "1 2 3 4"),
     "world": (

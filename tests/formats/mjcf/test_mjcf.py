@@ -141,12 +141,6 @@ FILES = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """MuJoCo writes its warnings to a file where it runs."""
-    monkeypatch.chdir(tmp_path)
-
-
 @pytest.mark.parametrize("name", FILES)
 def test_mass_matrix_and_forces_are_those_of_mujoco(name: str) -> None:
     check_dynamics(Twins(FILES[name]))

@@ -23,7 +23,7 @@ from srm_mbs.integration.generated.expressions import Expression, Recorder
 from srm_mbs.integration.generated.frames import shortest_terms
 from srm_mbs.integration.generated.structure import structure_of
 from tests.support.bundled import load
-from tests.support.dynamics import mass_matrix, nonlinear_effects
+from tests.support.dynamics import mass_matrix, nonlinear_effects, states_around
 from tests.support.generated import values_of
 from tests.support.mechanisms import rod
 
@@ -153,20 +153,12 @@ def _terms_of(name: str) -> _Terms:
     return _Terms(MECHANISMS[name]())
 
 
-def _states(mechanism: srm.Mechanism) -> list[tuple[FloatArray, FloatArray]]:
-    model, rng = mechanism.model, np.random.default_rng(8)
-    return [
-        (pin.integrate(model, mechanism.q0, rng.uniform(-1, 1, nv)), rng.uniform(-2, 2, nv))
-        for nv in [model.nv] * 2
-    ]
-
-
 @pytest.mark.parametrize("name", MECHANISMS)
 def test_derivatives_of_the_tree_are_pinocchios(name: str) -> None:
     terms = _terms_of(name)
     model, nv = terms.mechanism.model, terms.nv
     data = model.createData()
-    for q, v in _states(terms.mechanism):
+    for q, v in states_around(terms.mechanism, 2):
         found = terms.derivatives(q, v)
         pin.computeRNEADerivatives(model, data, q, v, np.zeros(nv))
         by_q, by_v = data.dtau_dq.copy(), data.dtau_dv.copy()
@@ -186,7 +178,7 @@ def test_derivatives_of_the_tree_are_pinocchios(name: str) -> None:
 def test_derivatives_of_the_rows_are_those_of_differences_along_the_chart(name: str) -> None:
     terms = _terms_of(name)
     model, nv, step = terms.mechanism.model, terms.nv, 2.0**-17
-    for q, v in _states(terms.mechanism):
+    for q, v in states_around(terms.mechanism, 2):
         found, here = terms.derivatives(q, v), terms.rows_at(q, v)
         for name_of_term, own in found.items():
             if name_of_term not in here:
@@ -222,7 +214,7 @@ def test_derivatives_by_parameters_are_those_of_other_models() -> None:
     body = model.inertias[joint]
     heavier.inertias[joint] = pin.Inertia(body.mass + 1.0, body.lever, body.inertia)
     falling.gravity.linear = model.gravity.linear + np.array([0.0, 0.0, 1.0])
-    for q, v in _states(terms.mechanism):
+    for q, v in states_around(terms.mechanism, 2):
         found = terms.derivatives(q, v, [{mass: one}, {gravity: one}])
         M = mass_matrix(heavier, q) - mass_matrix(model, q)
         assert np.abs(found["M"][..., 0] - M).max() < 1e-13 * np.abs(M).max()

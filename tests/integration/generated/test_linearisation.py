@@ -24,6 +24,7 @@ from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.integration.methods.linear_split_step import LinearSplitStep, linearised
 from srm_mbs.integration.methods.tableaus import get_tableau
 from tests.support.bundled import load
+from tests.support.dynamics import states_around
 from tests.support.mechanisms import rod
 from tests.support.stiff import bushed_four_bar
 
@@ -120,14 +121,6 @@ MECHANISMS: dict[str, Callable[[], srm.Mechanism]] = {
 }
 
 
-def _states(mechanism: srm.Mechanism) -> list[tuple[FloatArray, FloatArray]]:
-    model, rng = mechanism.model, np.random.default_rng(8)
-    return [
-        (pin.integrate(model, mechanism.q0, rng.uniform(-1, 1, nv)), rng.uniform(-2, 2, nv))
-        for nv in [model.nv] * 3
-    ]
-
-
 LARGE = {"a walker with damping", "a walker with damping in all joints", "a chain on a plane"}
 
 
@@ -154,7 +147,7 @@ def test_the_linearised_equations_are_those_of_differences(
     def rate(state: FloatArray) -> FloatArray:
         return system.evaluate(0.3, state, None).rate()[nv:].copy()
 
-    for q, v in _states(mechanism):
+    for q, v in states_around(mechanism, 3):
         state = np.concatenate([q, v])
         J, of_laws, by_laws = (
             flat.reshape(n, -1).T if flat.size == n * n else flat

@@ -12,16 +12,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import cast
 
-import numpy as np
-
-from srm_mbs.errors import InputError, safe_repr
+from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.base import DelegatingMethod, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.tableaus import check_explicit
 from srm_mbs.integration.methods.thesis.iterated_sweeps import First, IteratedSweeps
 from srm_mbs.integration.methods.thesis.regularisation import Regularisation, parse_eps
-from srm_mbs.integration.methods.thesis.sweep import checked_regulariser, interpolant
+from srm_mbs.integration.methods.thesis.sweep import REGULARISERS, interpolant
 from srm_mbs.model.lazy import cached_property
+from srm_mbs.model.numbers import choice, flag, positive_integer
 
 LARGEST_CARRIED = 3
 """Number of sweeps up to which restarting with the carried multiplier is stable (measured)."""
@@ -97,22 +96,10 @@ class SRM(DelegatingMethod):
         order, m = self.scheme.order, self.iterations
         if m is None:
             m = min(order, LARGEST_CARRIED) if self.carry else order
-        if isinstance(m, np.integer):
-            m = int(m)
+        m = positive_integer(m, "iterations", "Give a positive integer", " of sweeps")
         object.__setattr__(self, "iterations", m)
-        if isinstance(m, bool) or not isinstance(m, int) or m < 1:
-            raise InputError(
-                f"iterations = {safe_repr(m)} is not a number of sweeps",
-                element="iterations",
-                remedy="Give a positive integer",
-            )
         for name in ("restart", "carry"):
-            if not isinstance(getattr(self, name), bool):
-                raise InputError(
-                    f"{name} = {safe_repr(getattr(self, name))} is neither True nor False",
-                    element=name,
-                    remedy="Give True or False",
-                )
+            object.__setattr__(self, name, flag(getattr(self, name), name))
         if self.carry and not self.restart:
             raise InputError(
                 "carry=True without restart=True: sweeps with their own history start from 0",
@@ -125,7 +112,7 @@ class SRM(DelegatingMethod):
                 element="iterations",
                 remedy=f"Use at most {LARGEST_CARRIED} sweeps, or carry=False",
             )
-        checked_regulariser(self.T)
+        choice(self.T, REGULARISERS, "T")
         self.stepper  # noqa: B018 - bad eps or interpolation is refused now
 
     @cached_property

@@ -15,11 +15,11 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System, Terms, Zone
-from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.integration.methods.base import IntegratorState, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.near_singular import NEAR_STEPS, WATCHED_SIGMA, BranchStages
+from srm_mbs.model.numbers import choice
 
 Answer = Callable[[Terms, int], tuple[FloatArray, FloatArray]]
 """(terms, node) -> tangent rate and multiplier there; the equation that a sweep integrates."""
@@ -33,22 +33,6 @@ ROTATION_MARGIN = 2.0
 
 REGULARISERS = ("identity", "transpose", "inverse")
 """The matrices T of (2.2): I, (GB)^T, (GB)^-1."""
-
-
-def checked_regulariser(T: str) -> None:
-    """Refuse a matrix T that sweeps do not have.
-
-    Raises
-    ------
-    InputError
-        For an unknown name.
-    """
-    if not isinstance(T, str) or T not in REGULARISERS:
-        raise InputError(
-            f"there is no T = {safe_repr(T)}",
-            element="T",
-            remedy=f"Known: {', '.join(map(repr, REGULARISERS))}",
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,13 +211,7 @@ def interpolant(
     InputError
         For a name that is not ``known``.
     """
-    if interpolation not in known:
-        raise InputError(
-            f"there is no interpolation {safe_repr(interpolation)}",
-            element="interpolation",
-            remedy=f"Known: {', '.join(map(repr, known))}",
-        )
-    if interpolation != "auto":
+    if choice(interpolation, known, "interpolation") != "auto":
         return interpolation
     extension = scheme.extensions.get("thesis", scheme.dense)
     return extension if extension.order >= GOOD_EXTENSION else "linear"

@@ -1,0 +1,205 @@
+// Python classes of dense output.
+#include <algorithm>
+#include <optional>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "binding.hpp"
+#include "dense.hpp"
+#include "sigma_dips.hpp"
+
+namespace srm {
+
+namespace {
+
+#define SRM_PY_STEPS(field)                                                           \
+    field(Array, times)             /* (k + 1,) */                                    \
+    field(Array, states)            /* (k + 1, nx) */                                 \
+    field(Array, rates)             /* (k, rates per step, n) */                      \
+    field(Array, corrections)       /* (k, n), or (k, 0) without closures */          \
+    field(Array, sigmas)            /* (k, stages + 1) */                             \
+    field(Array, stiff)             /* (k,), not 0: of the scheme for stiff problems */ \
+    field(Array, end_rate)          /* (n,) */                                        \
+    field(Array, break_rates)       /* (breaks, n) */                                 \
+    field(std::vector<long>, breaks)                                                  \
+    field(std::vector<long>, zones) /* numbers of the steps with a zone */            \
+    field(Array, layers)            /* (k, 2) */                                      \
+    field(double, end)              /* of the run (s) */
+
+// The accepted steps of a run, in NumPy arrays that are not copied.
+struct PySteps {
+    SRM_FIELDS(SRM_PY_STEPS)
+
+    StepArrays arrays(int nq, int nv, std::size_t abscissae) const {
+        const std::size_t k = rates.shape(0), n = 2 * static_cast<std::size_t>(nv);
+        const bool corrected = corrections.ndim() == 2 && corrections.shape(1) > 0;
+        expect("times", times, {k + 1});
+        expect("states", states, {k + 1, static_cast<std::size_t>(nq + nv)});
+        expect("rates", rates, {k, rates.ndim() == 3 ? rates.shape(1) : 0, n});
+        expect("corrections", corrections, {k, corrected ? n : 0});
+        expect("sigmas", sigmas, {k, abscissae});
+        expect("stiff", stiff, {k});
+        expect("end_rate", end_rate, {n});
+        expect("break_rates", break_rates, {breaks.size(), n});
+        StepArrays out;
+        out.count = static_cast<long>(k);
+        out.end = end;
+        out.width = static_cast<int>(rates.shape(1));
+        out.corrected = corrected;
+        out.times = times.data();
+        out.states = states.data();
+        out.rates = rates.data();
+        out.corrections = corrections.data();
+        out.sigmas = sigmas.data();
+        out.end_rate = end_rate.data();
+        out.breaks = breaks;
+        out.break_rates = break_rates.data();
+        expect("layers", layers, {k, 2});
+        out.layers = layers.data();
+        out.stiff.resize(k);
+        for (std::size_t i = 0; i < k; ++i) out.stiff[i] = stiff.data()[i] != 0.0;
+        out.in_zone.assign(k, 0);
+        for (long step : zones) {
+            if (step < 0 || step >= out.count)
+                throw nb::value_error("StepArrays.zones has a step that is not there");
+            out.in_zone[static_cast<std::size_t>(step)] = 1;
+        }
+        return out;
+    }
+
+    static void expect(const char* field, const Array& array,
+                       std::initializer_list<std::size_t> shape) {
+        bool same = array.ndim() == shape.size();
+        for (std::size_t i = 0; same && i < shape.size(); ++i)
+            same = array.shape(i) == shape.begin()[i];
+        if (same) return;
+        const std::string place = std::string("StepArrays.") + field;
+        throw nb::value_error((place + " has another shape").c_str());
+    }
+};
+
+// The steps of plain `records`, in the memory of these, of a run that ended with the last of them or
+// at `stop` (s) in it: without breakpoints, zones and layers.
+StepArrays arrays(const PyRecords& records, std::optional<double> stop) {
+    const StepRecords& r = records.records;
+    StepArrays out;
+    out.count = static_cast<long>(r.ranks.size());
+    out.end = stop.value_or(r.times.back());
+    out.width = static_cast<int>(records.stages);
+    out.corrected = records.corrected > 0;
+    out.times = r.times.data();
+    out.states = r.states.data();
+    out.rates = r.rates.data();
+    out.corrections = r.corrections.data();
+    out.sigmas = r.sigmas.data();
+    out.end_rate = records.end_rate.data();
+    out.stiff.assign(r.stiff.begin(), r.stiff.end());
+    out.in_zone.assign(r.ranks.size(), 0);
+    return out;
+}
+
+struct PyDense {
+    nb::object records;  // kept alive, as the arrays of `steps`
+    std::optional<PySteps> steps;
+    DenseOutput dense;
+    std::size_t nx;
+
+    PyDense(int nq, int nv, const std::vector<SchemeDense>& schemes,
+            const DenseConstants& constants, const PySteps& steps_)
+        : steps(steps_),
+          dense(nq, nv, schemes, constants,
+                steps->arrays(nq, nv, schemes.empty() ? 0 : schemes[0].abscissae.size())),
+          nx(static_cast<std::size_t>(nq + nv)) {}
+
+    PyDense(const std::vector<SchemeDense>& schemes, const DenseConstants& constants,
+            nb::object records_, std::optional<double> stop)
+        : PyDense(schemes, constants, nb::cast<const PyRecords&>(records_), stop) {
+        records = std::move(records_);
+    }
+
+    PyDense(const std::vector<SchemeDense>& schemes, const DenseConstants& constants,
+            const PyRecords& from, std::optional<double> stop)
+        : dense(static_cast<int>(from.nx - from.n / 2), static_cast<int>(from.n / 2), schemes,
+                constants, arrays(from, stop)),
+          nx(from.nx) {
+        const std::size_t stages = schemes[0].abscissae.size();
+        if (stages != from.stages) throw nb::value_error("the records have another number of stages");
+    }
+
+    nb::object states(nb::handle owner, const Array& t) {
+        System& system = system_in(owner);
+        const std::size_t k = t.size();
+        std::vector<double> out(k * nx);
+        // With the interpreter's lock held: threads may read one solution, and share its workspace.
+        dense.states(system, t.data(), static_cast<long>(k), out.data());
+        return owned_array(std::move(out), {k, nx});
+    }
+
+    nb::object between_ends(nb::handle owner, const Array& t, const Array& allowed) {
+        System& system = system_in(owner);
+        const std::size_t k = t.size();
+        const double* within = vector_of(allowed, 2 * system.nv, "allowed");
+        std::vector<double> out(k * nx);
+        dense.between_ends(system, t.data(), static_cast<long>(k), within, out.data());
+        return owned_array(std::move(out), {k, nx});
+    }
+};
+
+// Times (k,) of the samples of sigma, the dips and their tops; None if there are no dips.
+nb::object py_recorded_dips(const DipSearch& search, const Array& times, const Array& sigmas,
+                            double end) {
+    if (sigmas.ndim() != 2 || sigmas.shape(0) < 1 || times.ndim() != 1 ||
+        times.size() != sigmas.shape(0) + 1)
+        throw nb::value_error("times and sigmas have other shapes");
+    const long width = static_cast<long>(sigmas.shape(1));
+    expect_within("columns", search.columns, 0, width - 1);
+    SigmaDips found = recorded_dips(search, times.data(), sigmas.data(),
+                                    static_cast<long>(sigmas.shape(0)), width, end);
+    if (found.dips.empty()) return nb::none();
+    return nb::make_tuple(owned_array(std::move(found.t)), found.dips, found.tops);
+}
+
+// Whether the plain records of a run have no dips; false for stiff steps.  `stop` as for arrays().
+bool without_dips(const DipSearch& search, const PyRecords& records, std::optional<double> stop) {
+    const StepArrays steps = arrays(records, stop);
+    if (std::count(steps.stiff.begin(), steps.stiff.end(), 0) != steps.count) return false;
+    const long width = static_cast<long>(records.stages);
+    expect_within("columns", search.columns, 0, width - 1);
+    return recorded_dips(search, steps.times, steps.sigmas, steps.count, width, steps.end)
+        .dips.empty();
+}
+
+// Of each step with sigma (n, abscissae) whether its stages lie close to a singular configuration.
+std::vector<bool> py_close_to_singular(const std::vector<double>& abscissae, const Array& sigmas,
+                                       const DenseConstants& constants) {
+    if (sigmas.ndim() != 2 || sigmas.shape(1) != abscissae.size())
+        throw nb::value_error("sigmas has another shape");
+    std::vector<bool> out(sigmas.shape(0));
+    for (std::size_t i = 0; i < out.size(); ++i)
+        out[i] = close_to_singular(abscissae, sigmas.data() + i * abscissae.size(),
+                                   constants.close, constants.branch_below);
+    return out;
+}
+
+}  // namespace
+
+void bind_dense_output(nb::module_& m) {
+    m.def("recorded_dips", &py_recorded_dips);
+    m.def("without_dips", &without_dips, nb::arg("search"), nb::arg("records"),
+          nb::arg("stop").none());
+    m.def("close_to_singular", &py_close_to_singular);
+    bind_struct<PySteps>(m, "StepArrays");
+    nb::class_<PyDense>(m, "DenseOutput")
+        .def(nb::init<int, int, const std::vector<SchemeDense>&, const DenseConstants&,
+                      const PySteps&>(),
+             nb::arg("nq"), nb::arg("nv"), nb::arg("schemes"), nb::arg("constants"),
+             nb::arg("steps"))
+        .def(nb::init<const std::vector<SchemeDense>&, const DenseConstants&, nb::object,
+                      std::optional<double>>(),
+             nb::arg("schemes"), nb::arg("constants"), nb::arg("records"), nb::arg("stop").none())
+        .def("states", &PyDense::states)
+        .def("between_ends", &PyDense::between_ends);
+}
+
+}  // namespace srm

@@ -65,8 +65,6 @@ FORMAT = 5
 ARCHIVED_MODEL_FORMAT = 4
 """The format that holds models made in Python as archives of Pinocchio."""
 SEGMENTS_FORMAT = 1
-NO_REACH = Reach()
-"""No meshes are read but those that come with the package."""
 CONTENTS = "segments.json"
 """Entry of an archive of segments that describes the whole run."""
 SAVED_BY = "Give a file written by solution.save or srm-mbs simulate --out"

@@ -24,6 +24,7 @@ import numpy as np
 import srm_mbs as srm
 from srm_mbs.api import SOLUTIONS
 from srm_mbs.formats.archive import array_from
+from srm_mbs.model.reach import Reach
 from srm_mbs.simulation import storage
 
 MEMORY = 6 * 10**9
@@ -232,7 +233,7 @@ def outcome(content: bytes, rng: Rng) -> dict[str, Any]:
     """``refused`` with a message when it is loaded, ``refused when read`` where a value that the
     file may have makes the equations of motion unsolvable, or ``read``; all else is a fault."""
     try:
-        solution = storage.load_from(io.BytesIO(content), Path("run.npz"), SOLUTIONS)
+        solution = storage.load_from(io.BytesIO(content), Path("run.npz"), SOLUTIONS, Reach())
     except srm.InputError as error:
         message = str(error)
         ours = error.file and error.remedy and "Traceback" not in message and len(message) < 2000

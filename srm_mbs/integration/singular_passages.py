@@ -8,6 +8,8 @@ Both are found after the run, on its dense output.
   of the closures is followed on the dense output.  A minimum of it is a crossing if the part of G
   that loses rank changes sign across it (the motion passes through), or changes altogether (it
   departs on another branch); where the motion turns back, or passes by, that part stays the same.
+  Where all rates change their sign, that part there and on both sides tells whether the motion
+  passed twice or not at all, however close to the singular configuration it turned back.
 * A *bifurcation* is a singular configuration at which the motion comes to rest, or turns back so
   close to it that it could not be told from one that rests there.  Several branches meet there;
   momentum chooses one, and without momentum the continuation is not unique.  The run keeps the

@@ -1,6 +1,5 @@
 #include "branch_motion.hpp"
 
-
 #include "limits.hpp"
 #include "linear.hpp"
 

@@ -11,7 +11,6 @@ namespace srm {
 
 namespace {
 
-
 std::vector<double> with_end(const ButcherTableau& scheme) {
     std::vector<double> out(scheme.c);
     out.push_back(1.0);

@@ -28,7 +28,6 @@ public:
     // forces f (nv,) and bias (rows,).  threshold < 0: none.
     void factor(const double* M, const double* f, const double* bias, double threshold);
 
-
     // Keeps the motion tangential to the normals (count, nv), the weakest last, in place of the
     // rows that are not in use.
     void hold(const double* normals, int count);

@@ -10,7 +10,6 @@ namespace srm {
 
 namespace {
 
-
 // The largest of each value and its neighbours, as far as there are any.  Two windows make one of
 // the double width, up to the last power of 2; then two overlap.
 std::vector<double> largest_around(const std::vector<double>& values, int before, int after) {

@@ -87,7 +87,7 @@ class Mechanism(MechanismData):
         return self.structure.redundant_rows
 
     def _at(self, q0: Any, v0: Any, names: tuple[str, str]) -> Self:
-        """As there, with the analysis of this one."""
+        """As of the base class, with the analysis of this one."""
         changed = super()._at(q0, v0, names)
         structure = structure_of.kept(self)
         if structure is not None:

@@ -351,11 +351,11 @@ def _check_quadrature(
 ) -> None:
     """Refuse weights, one row for each of the ``ends``, that do not integrate the powers below
     ``order`` from 0 to there."""
-    for k in range(1, order + 1):
-        powers, exact = nodes ** (k - 1), ends**k / k
-        wrong = np.abs(rows @ powers - exact) > _ROUNDING * (1.0 + np.abs(rows) @ np.abs(powers))
-        if wrong.any():
-            raise ValueError(
-                f"{what} is {order}, but t^{k - 1} is integrated with an error of "
-                f"{np.abs(rows @ powers - exact).max():.1e}"
-            )
+    exponents = np.arange(order)
+    powers, exact = nodes[:, None] ** exponents, ends[:, None] ** (exponents + 1) / (exponents + 1)
+    errors = np.abs(rows @ powers - exact)
+    wrong = (errors > _ROUNDING * (1.0 + np.abs(rows) @ np.abs(powers))).any(axis=0)
+    for k in np.flatnonzero(wrong):
+        raise ValueError(
+            f"{what} is {order}, but t^{k} is integrated with an error of {errors[:, k].max():.1e}"
+        )

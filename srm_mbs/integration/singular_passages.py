@@ -596,8 +596,8 @@ class RecordedDips:
     tops: IndexArray
     turns: Sequence[Turn] | None = None
 
-    def told(self, others: IndexArray, turns: Sequence[Turn]) -> RecordedDips:
-        """The same with the minima ``others`` (k,) that are at no turn, and these ``turns``."""
+    def at_no_turn(self, others: IndexArray, turns: Sequence[Turn]) -> RecordedDips:
+        """The minima ``others`` (k,), and the ``turns`` found among the rest."""
         return RecordedDips(self.samples[others], self.tops[others], turns)
 
 
@@ -693,7 +693,7 @@ def recorded_turns(
     not before."""
     every = np.arange(len(dips.tops))
     if monitor.geometry.drives or np.logical_or.reduce(steps.stiff):
-        return dips.told(every, ())
+        return dips.at_no_turn(every, ())
     columns = scheme.member(False).distinct
     stages, samples = len(columns), dips.samples
     # A turn beyond may show as two minima.
@@ -713,7 +713,7 @@ def recorded_turns(
     own = np.flatnonzero(alone)
     found, t, q = _reversals(monitor, steps, first[own], last[own])
     if not len(found):
-        return dips.told(every, ())
+        return dips.at_no_turn(every, ())
     found = own[found]
     lowest, highest, first, last = (values[found] for values in (lowest, highest, first, last))
     tops = dips.tops[lowest]
@@ -742,7 +742,7 @@ def recorded_turns(
         taken |= minima
         if values[0, i] < 0.0:
             turns.append(Turn(times[:, i].tolist(), values[:, i].tolist(), int(tops[i])))
-    return dips.told(np.delete(every, list(taken)), turns)
+    return dips.at_no_turn(np.delete(every, list(taken)), turns)
 
 
 def _times_around(

@@ -696,9 +696,11 @@ def recorded_turns(
         return dips.at_no_turn(every, ())
     columns = scheme.member(False).distinct
     stages, samples = len(columns), dips.samples
-    # A turn beyond may show as two minima.
-    doubled = np.flatnonzero(samples[:-1, 2] == samples[1:, 0])
-    lowest, highest = np.append(doubled, every), np.append(doubled + 1, every)
+    # A turn beyond may show as several minima, one next to the other.
+    starts = np.flatnonzero(np.append(True, samples[1:, 0] != samples[:-1, 2]))
+    ends = np.append(starts[1:], len(every)) - 1
+    several = ends > starts
+    lowest, highest = np.append(starts[several], every), np.append(ends[several], every)
     first, last = (
         (np.maximum(samples[lowest, 0] - 1, 0)) // stages,
         (samples[highest, 2] - 1) // stages,
@@ -735,8 +737,8 @@ def recorded_turns(
         certain &= value * recorded_side > untouched * side
     taken: set[int] = set()
     turns = []
-    for i in np.flatnonzero(certain).tolist():  # those of two minima first
-        minima = {int(lowest[i]), int(highest[i])}
+    for i in np.flatnonzero(certain).tolist():  # those of several minima first
+        minima = set(range(lowest[i], highest[i] + 1))
         if minima & taken:
             continue
         taken |= minima

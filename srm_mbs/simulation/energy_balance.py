@@ -117,7 +117,6 @@ class BalancedRun(Protocol):
 
     mechanism: Mechanism
     scheme: ButcherTableau
-    t_eval: FloatArray | None
 
     @property
     def t(self) -> FloatArray:
@@ -130,6 +129,10 @@ class BalancedRun(Protocol):
     @property
     def v(self) -> FloatArray:
         """Velocities (n, nv)."""
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Start and end (s) of the run."""
 
     @property
     def steps(self) -> StepData:
@@ -183,7 +186,7 @@ class Nodes:
         if not (self._smooth and len(self._scheme.dense.extra_c) and steps.count):
             return out
         with_stages = self._run.steps_with_stages
-        if self._run.t_eval is None and steps.stop is None:  # all intervals are steps
+        if np.array_equal(ends, steps.times):  # all intervals are steps
             return np.where(with_stages, np.arange(steps.count), out)
         step = np.clip(np.searchsorted(steps.times, ends[:-1]), 0, steps.count - 1)
         whole = (steps.times[step] == ends[:-1]) & (steps.times[step + 1] == ends[1:])
@@ -310,17 +313,23 @@ def _dampers_alone(mechanism: Mechanism) -> bool:
     )
 
 
-def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
-    """The balance of ``solution`` at its times; ``system`` is the one that made it.
+def energy_balance(
+    solution: BalancedRun, system: _System, t: FloatArray, energies: FloatArray
+) -> EnergyBalance:
+    """The balance of ``solution`` at times (n,) s; ``system`` is the one that made it.
+
+    Parameters
+    ----------
+    t, energies
+        The times, and kinetic and potential energy (n, 2) J there.
 
     Raises
     ------
     EvaluationError
         If a force cannot be evaluated.
     """
-    t, energies, times = solution.t, solution.energies, solution.steps.times
     first = energies[:1]
-    if not len(t) or t[0] != times[0]:
+    if not len(t) or t[0] != solution.span[0]:
         nq, states = solution.mechanism.model.nq, solution.steps.states[:1]
         first = solution.observables.energies(states[:, :nq], states[:, nq:])
     works = _works(solution, system, t) if _acted_on(system) else {}
@@ -339,12 +348,12 @@ def _acted_on(system: _System) -> bool:
 
 
 def _works(solution: BalancedRun, system: _System, t: FloatArray) -> Powers:
-    """The works (n,) J up to the times ``t`` (n,), of which a run without output times has all."""
-    place: IndexArray | slice = slice(None)
-    ends = t
-    if solution.t_eval is not None:  # steps are integrated whole
-        times = solution.steps.times
-        ends = np.unique(np.concatenate([times[:1], times[times < solution.steps.end], t]))
+    """The works (n,) J up to the times ``t`` (n,)."""
+    steps = solution.steps
+    ends = np.append(steps.times[:-1], steps.end)
+    place = np.searchsorted(ends, t)
+    if not np.array_equal(ends[np.minimum(place, steps.count)], t):  # steps are integrated whole
+        ends = np.unique(np.concatenate([ends[:-1], t]))
         place = np.searchsorted(ends, t)
     nodes = Nodes(solution, system, ends)
     powers = {name: one for term in TERMS for name, one in term(nodes, system).items()}

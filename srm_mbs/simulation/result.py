@@ -15,7 +15,7 @@ from srm_mbs.dynamics.constraints.reactions import Reactions
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.dynamics.observables import Invariants, Observables
+from srm_mbs.dynamics.observables import Observables
 from srm_mbs.dynamics.point_motion import (
     Place,
     PointMotion,
@@ -36,8 +36,10 @@ from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import Occurrence
 from srm_mbs.integration.kernel import dense_output as kernel_steps
 from srm_mbs.integration.kernel.backend import COMPILED
+from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.observables import CompiledObservables
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.run_samples import RunSamples, run_samples
 from srm_mbs.integration.singular_passages import (
     Bifurcation,
     Crossing,
@@ -269,7 +271,6 @@ class SimulationResult(RunOutcome):
     """
 
     request: RunOptions | None = None
-    _invariants: Invariants | None = None
 
     def __init__(
         self,
@@ -497,6 +498,12 @@ class SimulationResult(RunOutcome):
         dense = self._dense
         return dense(t) if allowed is None else dense.between_ends(t, allowed)
 
+    def samples(self) -> RunSamples:
+        """Samples that show the accuracy of a run of one segment, whatever ``t`` holds."""
+        dense, unit = self._dense, self.mechanism.structure.units.state
+        found = dense.samples(unit) if isinstance(dense, CompiledDenseOutput) else None
+        return found or run_samples(self.scheme, self.steps, dense, unit)
+
     def unwrapped(self, name: str, t: FloatArray, states: FloatArray) -> FloatArray:
         """Angle (k,) rad of a joint that is stored as cosine and sine, with the ``states``
         (k, nq + nv) at the times ``t`` (k,) s."""
@@ -555,23 +562,13 @@ class SimulationResult(RunOutcome):
     def drift(self) -> FloatArray:
         """Closure errors (n, 2): ||g - s|| (m, rad) and ||G v - s'|| (m/s, rad/s), s the motion of
         the drives; all rows, unscaled."""
-        known = self._invariants
-        g, c = known[:2] if known else self.observables.closure_errors(self.t, self.q, self.v)
+        g, c = self.observables.closure_errors(self.t, self.q, self.v)
         return np.column_stack([np.linalg.norm(g, axis=1), np.linalg.norm(c, axis=1)])
-
-    @property
-    def invariants(self) -> Invariants:
-        """Closure errors of all rows, unscaled, and energies at ``t``, which take one pass over the
-        bodies together."""
-        if self._invariants is None:
-            self._invariants = self.observables.invariants(self.t, self.q, self.v)
-        return self._invariants
 
     @property
     def energies(self) -> FloatArray:
         """Kinetic and potential energy (n, 2) J."""
-        known = self._invariants
-        return known.energies if known else self.observables.energies(self.q, self.v)
+        return self.observables.energies(self.q, self.v)
 
     @cached_property
     def energy(self) -> FloatArray:
@@ -641,8 +638,13 @@ class SimulationResult(RunOutcome):
         InputError
             For a loaded run that had a controller or a ``UserForce``.
         """
+        return self.balance_at(self.t, self.energies)
+
+    def balance_at(self, t: FloatArray, energies: FloatArray) -> EnergyBalance:
+        """As :attr:`energy_balance` at the times ``t`` (n,) s, ascending, with the energies (n, 2)
+        there."""
         self._need_controller("energy balance")
-        return energy_balance(self, self._system)
+        return energy_balance(self, self._system, t, energies)
 
     def _need_controller(self, what: str) -> None:
         system = self._system

@@ -7,6 +7,7 @@
 
 #include "binding.hpp"
 #include "dense.hpp"
+#include "run_samples.hpp"
 #include "sigma_dips.hpp"
 
 namespace srm {
@@ -19,6 +20,7 @@ namespace {
     field(Array, rates)             /* (k, rates per step, n) */                      \
     field(Array, corrections)       /* (k, n), or (k, 0) without closures */          \
     field(Array, sigmas)            /* (k, stages + 1) */                             \
+    field(Array, error_ratios)      /* (k,) */                                        \
     field(Array, stiff)             /* (k,), not 0: of the scheme for stiff problems */ \
     field(Array, end_rate)          /* (n,) */                                        \
     field(Array, break_rates)       /* (breaks, n) */                                 \
@@ -39,6 +41,7 @@ struct PySteps {
         expect("rates", rates, {k, rates.ndim() == 3 ? rates.shape(1) : 0, n});
         expect("corrections", corrections, {k, corrected ? n : 0});
         expect("sigmas", sigmas, {k, abscissae});
+        expect("error_ratios", error_ratios, {k});
         expect("stiff", stiff, {k});
         expect("end_rate", end_rate, {n});
         expect("break_rates", break_rates, {breaks.size(), n});
@@ -52,6 +55,7 @@ struct PySteps {
         out.rates = rates.data();
         out.corrections = corrections.data();
         out.sigmas = sigmas.data();
+        out.error_ratios = error_ratios.data();
         out.end_rate = end_rate.data();
         out.breaks = breaks;
         out.break_rates = break_rates.data();
@@ -93,6 +97,7 @@ StepArrays arrays(const PyRecords& records, std::optional<double> stop) {
     out.rates = r.rates.data();
     out.corrections = r.corrections.data();
     out.sigmas = r.sigmas.data();
+    out.error_ratios = r.error_ratios.data();
     out.end_rate = records.end_rate.data();
     out.stiff.assign(r.stiff.begin(), r.stiff.end());
     out.in_zone.assign(r.ranks.size(), 0);
@@ -134,6 +139,18 @@ struct PyDense {
         // With the interpreter's lock held: threads may read one solution, and share its workspace.
         dense.states(system, t.data(), static_cast<long>(k), out.data());
         return owned_array(std::move(out), {k, nx});
+    }
+
+    // RunSamples of run_samples.py.
+    nb::tuple samples(nb::handle owner, const SampleRules& rules, nb::handle unit) {
+        System& system = system_in(owner);
+        const std::vector<double> units = numbers(unit, 2 * system.nv, "unit");
+        SampleTimes found = sample_times(dense.steps(), rules, units, dense.takes_stages());
+        const std::size_t k = found.t.size();
+        std::vector<double> out(k * nx);
+        dense.states(system, found.t.data(), static_cast<long>(k), out.data());
+        return nb::make_tuple(owned_array(std::move(found.t)),
+                              owned_array(std::move(out), {k, nx}), found.ends, found.whole);
     }
 
     nb::object between_ends(nb::handle owner, const Array& t, const Array& allowed) {
@@ -199,6 +216,7 @@ void bind_dense_output(nb::module_& m) {
                       std::optional<double>>(),
              nb::arg("schemes"), nb::arg("constants"), nb::arg("records"), nb::arg("stop").none())
         .def("states", &PyDense::states)
+        .def("samples", &PyDense::samples)
         .def("between_ends", &PyDense::between_ends);
 }
 

@@ -54,7 +54,7 @@ struct StepArrays {
     double end = 0.0;        // of the run (s)
     int width = 0;           // rates per step
     bool corrected = false;
-    const double *times, *states, *rates, *corrections, *sigmas, *end_rate;
+    const double *times, *states, *rates, *corrections, *sigmas, *error_ratios, *end_rate;
     std::vector<char> in_zone;  // (count,)
     const double* layers = nullptr;  // (count, 2), time and width (s) of the layer; width 0: none
     std::vector<char> stiff;    // (count,), of the scheme for stiff problems, if there is one
@@ -82,6 +82,10 @@ public:
     // The same by polynomials through ends of steps, without an evaluation, where two of them agree
     // within `allowed` (n,).
     void between_ends(System& system, const double* t, long k, const double* allowed, double* out);
+
+    const StepArrays& steps() const { return steps_; }
+    // Whether a step takes further stages to be read.
+    bool takes_stages() const { return schemes_[0].extension.extra_stages() > 0; }
 
     static constexpr int most_nodes = 16;  // of a polynomial
 

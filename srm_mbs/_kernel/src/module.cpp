@@ -9,6 +9,7 @@
 #include "interpreter.hpp"
 #include "manifold.hpp"
 #include "regular_start.hpp"
+#include "run_samples.hpp"
 #include "separated_rows.hpp"
 #include "sigma_dips.hpp"
 
@@ -44,6 +45,7 @@ void bind_structs(nb::module_& m) {
     bind_struct<Extension>(m, "Extension");
     bind_struct<SchemeDense>(m, "SchemeDense");
     bind_struct<DenseConstants>(m, "DenseConstants");
+    bind_struct<SampleRules>(m, "SampleRules");
     bind_struct<DipSearch>(m, "DipSearch");
     bind_struct<EventConstants>(m, "EventConstants");
     bind_struct<BranchCurve>(m, "BranchCurve");

@@ -20,6 +20,7 @@ from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import CompiledObservables
 from srm_mbs.integration.kernel.system import make_kernel_system, shared, workspace
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.run_samples import RunSamples
 from srm_mbs.integration.singular_passages import RecordedDips
 from srm_mbs.model.lazy import cached_property
 
@@ -89,37 +90,46 @@ class CompiledDenseOutput(DenseOutput):
         if self._by_reference:
             return super().__call__(t)
         try:
-            return self._read(t)
+            return self._read("states", _as_array(t))  # type: ignore[no-any-return]
         except ArithmeticError:
             return super().__call__(t)  # raises the error that says why
         except IndexError:
             self.check(t)  # raises
             raise
 
+    def samples(self, unit: FloatArray) -> RunSamples | None:
+        """As :func:`srm_mbs.integration.run_samples.run_samples`; None where that has to read the
+        run, or raises the error that says why it cannot be read."""
+        if self._by_reference:
+            return None
+        try:
+            return RunSamples(*self._read("samples", marshalling.sample_rules(), unit))
+        except ArithmeticError:
+            return None
+
     def between_ends(self, t: FloatArray, allowed: FloatArray) -> FloatArray:
         """As the reference (:meth:`DenseOutput.between_ends`)."""
         if self._by_reference:
             return super().between_ends(t, allowed)
         try:
-            return self._read(t, allowed)
+            return self._read("between_ends", _as_array(t), allowed)  # type: ignore[no-any-return]
         except ArithmeticError:
             return super().between_ends(t, allowed)  # raises the error that says why
         except IndexError:
             self.check(t)  # raises
             raise
 
-    def _read(self, t: FloatArray, *allowed: FloatArray) -> FloatArray:
+    def _read(self, what: str, *arguments: Any) -> Any:
         if self.kernel_system is not None:
-            return self._states(self.kernel_system, t, *allowed)
+            return self._read_by(self.kernel_system, what, *arguments)
         code = code_of_record(self._made_by, self._mechanism_system.mechanism)
         with workspace(self._mechanism_system, code) as kernel_system:
-            return self._states(kernel_system, t, *allowed)
+            return self._read_by(kernel_system, what, *arguments)
 
-    def _states(self, kernel_system: Any, t: FloatArray, *allowed: FloatArray) -> FloatArray:
+    def _read_by(self, kernel_system: Any, what: str, *arguments: Any) -> Any:
         before = kernel_system.evaluations, kernel_system.factorisations
-        read = self._compiled.between_ends if allowed else self._compiled.states
         try:
-            return read(kernel_system, np.ascontiguousarray(t, dtype=float), *allowed)  # type: ignore[no-any-return]
+            return getattr(self._compiled, what)(kernel_system, *arguments)
         finally:
             self._mechanism_system.count(
                 kernel_system.evaluations - before[0], kernel_system.factorisations - before[1]
@@ -150,6 +160,10 @@ class CompiledDenseOutput(DenseOutput):
             return core.DenseOutput(schemes, constants, *self.recorded)  # type: ignore[union-attr]
         steps = marshalling.steps_struct(self._steps)
         return core.DenseOutput(system.nq, system.nv, schemes, constants, steps)  # type: ignore[union-attr]
+
+
+def _as_array(t: FloatArray) -> FloatArray:
+    return np.ascontiguousarray(t, dtype=float)
 
 
 @lru_cache(maxsize=64)

@@ -161,13 +161,22 @@ class CompiledObservables(Observables):
         except ArithmeticError:
             return super().closure_errors(t, q, v)
 
-    def invariants(self, t: FloatArray, q: FloatArray, v: FloatArray) -> Invariants:
+    def invariants(
+        self,
+        t: FloatArray,
+        states: FloatArray,
+        ends: list[int],
+        whole: int,
+        order: list[int],
+        starts: list[int],
+    ) -> Invariants:
         """As the reference, with one pass over the bodies."""
+        numbers = t, states, ends, whole, order, starts
         try:
             with self._all_rows() as kernel_system:
-                return Invariants(*kernel_system.closure_errors(*_states(t, q, v), True))
+                return Invariants(*kernel_system.invariants(*numbers))
         except ArithmeticError:
-            return super().invariants(t, q, v)
+            return super().invariants(*numbers)
 
     def jacobians(self, t: FloatArray, q: FloatArray) -> FloatArray:
         times, places = np.ascontiguousarray(t, dtype=float), np.ascontiguousarray(q)

@@ -170,7 +170,7 @@ class Nodes:
     """
 
     def __init__(self, solution: BalancedRun, system: _System, ends: FloatArray) -> None:
-        self._run, self._ends = solution, ends
+        self._run, self._ends, self._lengths = solution, ends, ends[1:] - ends[:-1]
         # Dampers do all the work, and no force has a kink.
         acting = system.controlled or system.has_friction
         self._smooth = not acting and _dampers_alone(system.mechanism)
@@ -203,7 +203,7 @@ class Nodes:
         read, (points, _) = self._steps < 0, self._gauss
         if not np.logical_or.reduce(read):
             return np.zeros(0)
-        starts, lengths = self._ends[:-1][read], np.diff(self._ends)[read]
+        starts, lengths = self._ends[:-1][read], self._lengths[read]
         return (starts[:, None] + np.outer(lengths, 0.5 * (points + 1.0))).ravel()
 
     @property
@@ -243,12 +243,12 @@ class Nodes:
             return {name: power.ravel() for name, power in parts[0].items()}
         return {name: np.concatenate([part[name].ravel() for part in parts]) for name in parts[0]}
 
-    def works(self, powers: Powers) -> Powers:
-        """Work (n + 1,) J up to each of the ends by each of the ``powers`` (k,) W."""
+    def works(self, powers: Powers, place: IndexArray) -> Powers:
+        """Work (m,) J up to those of the ends at ``place`` (m,) by each of the ``powers`` (k,) W."""
         if not powers:
             return {}
         power = np.array(list(powers.values()))
-        at_stages, lengths = self._steps >= 0, np.diff(self._ends)
+        at_stages, lengths = self._steps >= 0, self._lengths
         nodes = len(self._started) * len(self._stages)
         out = np.zeros((len(powers), len(self._ends)))
         gained = out[:, 1:]
@@ -259,7 +259,7 @@ class Nodes:
             if own.size:
                 mean = own.reshape(len(own), -1, len(weights)) @ weights
                 gained[:, chosen] = lengths[chosen] * mean
-        return dict(zip(powers, np.cumsum(out, axis=1)))
+        return dict(zip(powers, np.add.accumulate(out, axis=1)[:, place]))
 
 
 def _controller(nodes: Nodes, system: _System) -> Powers:
@@ -357,7 +357,7 @@ def _works(solution: BalancedRun, system: _System, t: FloatArray) -> Powers:
         place = np.searchsorted(ends, t)
     nodes = Nodes(solution, system, ends)
     powers = {name: one for term in TERMS for name, one in term(nodes, system).items()}
-    return {name: work[place] for name, work in nodes.works(powers).items()}
+    return nodes.works(powers, place)
 
 
 def _largest(values: FloatArray) -> float:

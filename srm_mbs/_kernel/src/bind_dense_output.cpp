@@ -187,16 +187,16 @@ bool without_dips(const DipSearch& search, const PyRecords& records, std::option
         .dips.empty();
 }
 
-// Of each step with sigma (n, abscissae) whether its stages lie close to a singular configuration.
-std::vector<bool> py_close_to_singular(const std::vector<double>& abscissae, const Array& sigmas,
+// Of each step with sigma (n, abscissae) 1 if its stages lie close to a singular configuration, else 0.
+nb::object py_close_to_singular(const std::vector<double>& abscissae, const Array& sigmas,
                                        const DenseConstants& constants) {
     if (sigmas.ndim() != 2 || sigmas.shape(1) != abscissae.size())
         throw nb::value_error("sigmas has another shape");
-    std::vector<bool> out(sigmas.shape(0));
+    std::vector<double> out(sigmas.shape(0));
     for (std::size_t i = 0; i < out.size(); ++i)
         out[i] = close_to_singular(abscissae, sigmas.data() + i * abscissae.size(),
                                    constants.close, constants.branch_below);
-    return out;
+    return owned_array(std::move(out));
 }
 
 }  // namespace

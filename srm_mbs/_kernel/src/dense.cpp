@@ -29,8 +29,6 @@ DenseOutput::DenseOutput(int nq, int nv, const std::vector<SchemeDense>& schemes
       steps_(std::move(steps)),
       n_(2 * nv),
       nx_(nq + nv),
-      extra_(steps_.count),
-      polynomials_(steps_.count),
       places_(steps_.count, Place::unknown),
       delta_(n_),
       x_(std::max(nx_, n_)),
@@ -138,9 +136,11 @@ void Extension::weights(double theta, double* out) const {
 }
 
 const std::vector<double>& DenseOutput::extra_rates(System& system, long step, double h) {
-    std::vector<double>& kept = extra_[step];
+    static const std::vector<double> none;
     const Extension& extension = scheme_of(step).extension;
-    if (!kept.empty() || steps_.width >= extension.n_rates) return kept;
+    if (steps_.width >= extension.n_rates) return none;
+    std::vector<double>& kept = extra_[step];
+    if (!kept.empty()) return kept;
     std::vector<double> out;  // kept only once all of them could be evaluated
     const double* rates = steps_.rates + step * steps_.width * n_;
     rate_.resize(n_);

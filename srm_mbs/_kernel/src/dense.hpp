@@ -3,6 +3,7 @@
 
 #include <limits>
 #include <memory>
+#include <unordered_map>
 #include <utility>
 #include <vector>
 
@@ -156,9 +157,9 @@ private:
     DenseConstants constants_;
     StepArrays steps_;
     const int n_, nx_;
-    // Of each step, empty until it needs them.
-    std::vector<std::vector<double>> extra_;
-    std::vector<Polynomial> polynomials_;
+    // Of the steps that needed them, which of long runs are few.
+    std::unordered_map<long, std::vector<double>> extra_;
+    std::unordered_map<long, Polynomial> polynomials_;
     enum class Place : char { unknown, regular, near_singular };
     std::vector<Place> places_;
     std::vector<double> delta_, x_, weights_, near_, rate_, points_, slopes_, differences_;

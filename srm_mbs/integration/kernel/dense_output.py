@@ -211,5 +211,8 @@ def without_passages(
 
 def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> BoolArray:
     """As :func:`srm_mbs.integration.dense_output.close_to_singular`, of sigmas (n, s + 1)."""
-    constants = marshalling.dense_constants()
-    return np.array(core.close_to_singular(abscissae.tolist(), sigmas, constants))  # type: ignore
+    found = core.close_to_singular(  # type: ignore[union-attr]
+        abscissae.tolist(), sigmas, marshalling.dense_constants()
+    )
+    close: BoolArray = found > 0.0
+    return close

@@ -410,7 +410,7 @@ class SimulationResult(RunOutcome):
             )
         return run.again()._run
 
-    @property
+    @cached_property
     def span(self) -> tuple[float, float]:
         """Start and end (s) of the run, whatever ``t`` holds."""
         output = self._run.output

@@ -983,7 +983,7 @@ class FinishedRun:
     @cached_property
     def stats(self) -> Statistics:
         if self._summary is not None:
-            steps, zone_steps = self._summary[:2]
+            steps, zone_steps = self._summary.steps, self._summary.zone_steps
         elif self.output is not None:
             steps, zone_steps = self.output.count, self.output.zone_steps
         else:

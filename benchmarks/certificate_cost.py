@@ -5,8 +5,8 @@
 Run from a checkout with the compiled kernel; BLAS runs on one thread.  CPU times of the process in
 milliseconds, the least of the repeats, each on a fresh run: other programs only add to them.
 ``certify`` is without its two ``reruns``, which are made and let go of again, and includes the
-passages and the balance where it reads them, and its text; ``of run`` and ``of runs`` are its parts, in per cent, of the run and of all
-three runs.
+passages and the balance where it reads them, and its text; ``of run`` and ``of runs`` are its
+parts, in per cent, of the run and of all three runs.
 ``n_four_bar_N`` is ``srm.n_four_bar(N)``; ``swing_X`` is a parallelogram that swings up to X rad
 before its change points, on both sides.
 """

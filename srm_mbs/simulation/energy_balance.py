@@ -154,6 +154,9 @@ class BalancedRun(Protocol):
     def energy_balance(self) -> EnergyBalance:
         """The balance at ``t``."""
 
+    def element_works(self, t: FloatArray) -> Powers | None:
+        """Works (n,) J up to ``t`` (n,) s by the stages of the run, of the kernel."""
+
     @property
     def drive_rates(self) -> Mapping[str, FloatArray]:
         """Prescribed rate of each drive (n,), m/s or rad/s."""
@@ -171,9 +174,7 @@ class Nodes:
 
     def __init__(self, solution: BalancedRun, system: _System, ends: FloatArray) -> None:
         self._run, self._ends, self._lengths = solution, ends, ends[1:] - ends[:-1]
-        # Dampers do all the work, and no force has a kink.
-        acting = system.controlled or system.has_friction
-        self._smooth = not acting and _dampers_alone(system.mechanism)
+        self._smooth = _is_smooth(system)
         self.observables = solution.observables
         self._scheme = solution.scheme.member(False)
         self._stages = np.flatnonzero(self._scheme.b)
@@ -244,7 +245,7 @@ class Nodes:
         return {name: np.concatenate([part[name].ravel() for part in parts]) for name in parts[0]}
 
     def works(self, powers: Powers, place: IndexArray) -> Powers:
-        """Work (m,) J up to those of the ends at ``place`` (m,) by each of the ``powers`` (k,) W."""
+        """Work (m,) J up to the ends at ``place`` (m,) by each of the ``powers`` (k,) W."""
         if not powers:
             return {}
         power = np.array(list(powers.values()))
@@ -285,7 +286,11 @@ def _elements(nodes: Nodes, system: _System) -> Powers:
     potential."""
     if not working_elements(system.mechanism):
         return {}
-    return {f"force {name}": power for name, power in nodes.element_powers().items()}
+    return _of_forces(nodes.element_powers())
+
+
+def _of_forces(elements: Powers) -> Powers:
+    return {f"force {name}": values for name, values in elements.items()}
 
 
 def _drives(nodes: Nodes, system: _System) -> Powers:
@@ -303,6 +308,12 @@ TERMS: tuple[Callable[[Nodes, _System], Powers], ...] = (
     _drives,
 )
 """Everything that does work beside the potentials; what is new is added here."""
+
+
+def _is_smooth(system: _System) -> bool:
+    """Whether dampers do all the work, and no force has a kink."""
+    acting = system.controlled or system.has_friction
+    return not acting and _dampers_alone(system.mechanism)
 
 
 @per_model
@@ -349,6 +360,12 @@ def _acted_on(system: _System) -> bool:
 
 def _works(solution: BalancedRun, system: _System, t: FloatArray) -> Powers:
     """The works (n,) J up to the times ``t`` (n,)."""
+    scheme = solution.scheme.member(False)
+    by_stages = scheme.implicit is None and len(scheme.dense.extra_c) > 0
+    if by_stages and _is_smooth(system) and not system.is_damped:
+        found = solution.element_works(t)
+        if found is not None:
+            return _of_forces(found)
     steps = solution.steps
     ends = np.append(steps.times[:-1], steps.end)
     place = np.searchsorted(ends, t)

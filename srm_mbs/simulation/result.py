@@ -49,7 +49,7 @@ from srm_mbs.integration.singular_passages import (
 )
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.lazy import cached_property
-from srm_mbs.simulation.energy_balance import EnergyBalance, energy_balance
+from srm_mbs.simulation.energy_balance import EnergyBalance, Powers, energy_balance
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.streamed_output import StreamedOutput
 
@@ -627,6 +627,15 @@ class SimulationResult(RunOutcome):
         (:meth:`~srm_mbs.integration.dense_output.StepData.with_stages`)."""
         close = kernel_steps.close_to_singular if self._by_kernel else close_to_singular
         return self.steps.with_stages(self.scheme, close)
+
+    def element_works(self, t: FloatArray) -> Powers | None:
+        """Work (n,) J of each force element, but that of its potential, up to the times ``t`` (n,)
+        s, by the scheme of the run at its own stages; None where it has to be integrated step by
+        step."""
+        dense, observables = self._dense, self.observables
+        if isinstance(dense, CompiledDenseOutput) and isinstance(observables, CompiledObservables):
+            return dense.element_works(observables, t)
+        return None
 
     @cached_property
     def energy_balance(self) -> EnergyBalance:

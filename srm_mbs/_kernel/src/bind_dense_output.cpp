@@ -153,6 +153,46 @@ struct PyDense {
                               owned_array(std::move(out), {k, nx}), found.ends, found.whole);
     }
 
+    // Works (k, elements) of `elements` from the start to the ends t (k,) of steps, ascending, by the
+    // stages with these rows of A (stages, s), c and weights b; None where t has other times, or a
+    // step has no stages on the motion.  owner: a system of all rows.
+    nb::object works(nb::handle owner, const Array& t, const std::vector<ForceElement>& elements,
+                     const Array& A, const Array& b, const Array& c) {
+        System& system = system_in(owner);
+        const StepArrays& all = dense.steps();
+        const std::size_t stages = c.size(), m = elements.size(), width = all.width;
+        if (!stages || b.size() != stages || A.size() % stages || A.size() / stages > width)
+            throw nb::value_error("A, b or c has another shape");
+        const StageArrays arrays{all.times, all.states, all.rates, A.data(),
+                                 c.data(),  width,      A.size() / stages, stages};
+        const std::size_t n = t.size();
+        std::vector<long> steps;
+        for (long step = 0; step < all.count && n && all.times[step] < t.data()[n - 1]; ++step) {
+            if (!dense.has_stages(step)) return nb::none();
+            steps.push_back(step);
+        }
+        std::vector<double> work(m, 0.0), powers(steps.size() * stages * m), out;
+        system.stage_powers(steps, arrays, system.separate(elements), powers.data());
+        const double* power = powers.data();
+        for (std::size_t step = 0, end = 0; end < n; ++step, power += stages * m) {
+            if (all.times[step] == t.data()[end]) {
+                out.insert(out.end(), work.begin(), work.end());
+                ++end;
+            }
+            if (step == steps.size()) {
+                if (end < n) return nb::none();
+                break;
+            }
+            const double h = all.times[step + 1] - all.times[step];
+            for (std::size_t e = 0; e < m; ++e) {
+                double mean = 0.0;
+                for (std::size_t i = 0; i < stages; ++i) mean += b.data()[i] * power[i * m + e];
+                work[e] += h * mean;
+            }
+        }
+        return owned_array(std::move(out), {n, m});
+    }
+
     nb::object between_ends(nb::handle owner, const Array& t, const Array& allowed) {
         System& system = system_in(owner);
         const std::size_t k = t.size();
@@ -217,6 +257,7 @@ void bind_dense_output(nb::module_& m) {
              nb::arg("schemes"), nb::arg("constants"), nb::arg("records"), nb::arg("stop").none())
         .def("states", &PyDense::states)
         .def("samples", &PyDense::samples)
+        .def("works", &PyDense::works)
         .def("between_ends", &PyDense::between_ends);
 }
 

@@ -112,6 +112,13 @@ bool DenseOutput::close_to_singular(long step) const {
                                   constants_.close, constants_.branch_below);
 }
 
+bool DenseOutput::has_stages(long step) const {
+    const std::vector<double>& abscissae = schemes_[0].abscissae;
+    return !steps_.in_zone[step] && !steps_.stiff[step] &&
+           !srm::close_to_singular(abscissae, steps_.sigmas + step * abscissae.size(),
+                                   constants_.close, constants_.branch_below);
+}
+
 bool close_to_singular(const std::vector<double>& abscissae, const double* sigmas, double close,
                        double branch_below) {
     const int width = static_cast<int>(abscissae.size());

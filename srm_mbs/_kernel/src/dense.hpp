@@ -85,6 +85,8 @@ public:
     void between_ends(System& system, const double* t, long k, const double* allowed, double* out);
 
     const StepArrays& steps() const { return steps_; }
+    // StepData.with_stages for one step of an explicit scheme.
+    bool has_stages(long step) const;
     // Whether a step takes further stages to be read.
     bool takes_stages() const { return schemes_[0].extension.extra_stages() > 0; }
 

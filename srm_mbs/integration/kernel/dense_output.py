@@ -107,6 +107,16 @@ class CompiledDenseOutput(DenseOutput):
         except ArithmeticError:
             return None
 
+    def element_works(
+        self, observables: CompiledObservables, t: FloatArray
+    ) -> dict[str, FloatArray] | None:
+        """Work (n,) J of each force element, but that of its potential, up to the ends ``t`` (n,) s
+        of steps, by the weights of the stages; None where the reference integrates it."""
+        if self._by_reference:
+            return None
+        stages = marshalling.weighted_stages(self._scheme.member(False))
+        return observables.element_works(self._compiled, t, *stages)
+
     def between_ends(self, t: FloatArray, allowed: FloatArray) -> FloatArray:
         """As the reference (:meth:`DenseOutput.between_ends`)."""
         if self._by_reference:

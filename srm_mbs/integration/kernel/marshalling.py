@@ -409,6 +409,13 @@ def scheme_dense(scheme: ButcherTableau) -> Any:
 
 
 @lru_cache(maxsize=64)
+def weighted_stages(scheme: ButcherTableau) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rows of A, weights and abscissae of the stages of ``scheme`` that have weights."""
+    stages = np.flatnonzero(scheme.b)
+    return scheme.A[stages], scheme.b[stages], scheme.c[stages]
+
+
+@lru_cache(maxsize=64)
 def scheme_denses(scheme: ButcherTableau) -> list[Any]:
     """The dense outputs of a run: of ``scheme`` and, where it has one, of its scheme for stiff
     problems."""

@@ -334,6 +334,22 @@ class CompiledObservables(Observables):
             return super().stage_powers(chosen, times, states, rates, A, c)
         return dict(zip(working_elements(self.mechanism), np.moveaxis(found, 2, 0)))
 
+    def element_works(
+        self, dense: Any, t: FloatArray, A: FloatArray, b: FloatArray, c: FloatArray
+    ) -> dict[str, FloatArray] | None:
+        """Work (n,) J of each element of :meth:`stage_powers` up to the ends ``t`` (n,) s of steps
+        of ``dense``, the dense output of the kernel, by the weights b (k,) of their stages; None
+        where that is not all, and where powers cannot be evaluated."""
+        structs = _structs_of_dampers(self.mechanism)
+        if structs is None:
+            return None
+        try:
+            with self._all_rows() as kernel_system:
+                found = dense.works(kernel_system, t, structs, A, b, c)
+        except ArithmeticError:
+            return None
+        return None if found is None else dict(zip(working_elements(self.mechanism), found.T))
+
 
 @per_model
 def _structs_of_dampers(mechanism: MechanismData) -> list[Any] | None:

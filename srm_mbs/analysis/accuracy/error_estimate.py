@@ -21,6 +21,7 @@ from srm_mbs.dynamics.scaling import angle_coordinates, start_rounding
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.psrm import is_split
 from srm_mbs.integration.run_samples import RunSamples
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model
 from srm_mbs.model.numbers import positive_number
 from srm_mbs.simulation.options import tightest_rtol
@@ -104,7 +105,7 @@ class Sizes:
     t: FloatArray
     size: FloatArray
 
-    @property
+    @cached_property
     def largest(self) -> float:
         """The largest of ``size``, positions and rates; 0 without any time."""
         return float(self.size.max(initial=0.0))
@@ -480,7 +481,7 @@ def compare(
 
     Windows around jumps of the state, whose times differ, are left out.
     """
-    times = times[: np.searchsorted(times, min(run.span[1], other.span[1]), side="right")]
+    times = times[: times.searchsorted(min(run.span[1], other.span[1]), side="right")]
     jumps = np.zeros(0)
     if len(run.segments) > 1 or len(other.segments) > 1:
         allowed, jumps = _between_jumps(run, other, times)

@@ -176,6 +176,8 @@ class RunData(Protocol):
     steps, dense
         The accepted steps and their dense output; None of a run with output times that did not
         keep them.
+    span
+        Start and end (s) of the steps that the run keeps.
     nodes
         Times (n + 1,) s and states (n + 1, nx) at the ends of the steps, as
         :meth:`~srm_mbs.integration.dense_output.DenseOutput.nodes`, of a run that has them.
@@ -194,6 +196,8 @@ class RunData(Protocol):
     def steps(self) -> StepData | None: ...
     @property
     def dense(self) -> DenseOutput | None: ...
+    @property
+    def span(self) -> tuple[float, float]: ...
     @property
     def nodes(self) -> tuple[FloatArray, FloatArray]: ...
     @property
@@ -229,6 +233,11 @@ class KnownRunData:
     output: StreamedOutput | None = None
     again: Callable[[], SimulationResult] | None = None
     bifurcations: tuple[Bifurcation, ...] | None = None
+
+    @property
+    def span(self) -> tuple[float, float]:
+        steps = cast(StepData, self.steps)
+        return float(steps.times[0]), steps.end
 
     @property
     def nodes(self) -> tuple[FloatArray, FloatArray]:
@@ -414,11 +423,7 @@ class SimulationResult(RunOutcome):
     def span(self) -> tuple[float, float]:
         """Start and end (s) of the run, whatever ``t`` holds."""
         output = self._run.output
-        if output is not None:
-            return output.span
-        if self.t_eval is None:
-            return float(self.t[0]), float(self.t[-1])
-        return super().span
+        return self._run.span if output is None else output.span
 
     @property
     def held(self) -> HeldForce | None:

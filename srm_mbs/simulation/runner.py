@@ -943,6 +943,13 @@ class FinishedRun:
     def steps(self) -> StepData | None:
         return self._record.data(self._options.method.scheme, self._system.tangent_size)
 
+    @property
+    def span(self) -> tuple[float, float]:
+        if self._summary is not None:
+            return cast(CompiledRecord, self._record).span()
+        steps = cast(StepData, self.steps)
+        return float(steps.times[0]), steps.end
+
     @cached_property
     def nodes(self) -> tuple[FloatArray, FloatArray]:
         record = self._record

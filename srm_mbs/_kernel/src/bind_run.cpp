@@ -480,6 +480,10 @@ void bind_run(nb::module_& m) {
         return owned_array(std::move(out), {5, r.ranks.size()});
     });
     records
+        .def_prop_ro("span",
+                     [](const PyRecords& r) {
+                         return nb::make_tuple(r.records.times.front(), r.records.times.back());
+                     })
         // StepSummary of driver.py.
         .def_prop_ro("steps", [](const PyRecords& r) { return r.records.ranks.size(); })
         .def_prop_ro("zone_steps", [](const PyRecords& r) { return r.records.zones.size(); })

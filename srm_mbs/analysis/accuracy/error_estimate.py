@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,8 +55,7 @@ SMALLEST_ORDER = 0.5
 """Observed order from which the differences of fixed steps are extrapolated to step 0."""
 
 
-@dataclass(frozen=True)
-class JointDifference:
+class JointDifference(NamedTuple):
     """The largest difference of two runs in one joint.
 
     Attributes
@@ -324,7 +323,7 @@ def estimate_error(
         compared.joints
         if beyond == 1.0
         else tuple(
-            replace(row, position=beyond * row.position, rate=beyond * row.rate)
+            row._replace(position=beyond * row.position, rate=beyond * row.rate)
             for row in compared.joints
         ),
         beyond * kept.largest,

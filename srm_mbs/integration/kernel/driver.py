@@ -106,6 +106,11 @@ class CompiledRecord(RunRecord):
             return None
         return np.array([times[0], self.stop]), np.array([states[0], self.stop_state])
 
+    def span(self) -> tuple[float, float]:
+        """Start and end (s) of the steps that no sink took, after :meth:`close`."""
+        start, end = self._records.span
+        return start, end if self.stop is None else self.stop
+
     def summary(self) -> StepSummary | None:
         """The summary of the steps that no sink took, after :meth:`close`; None before."""
         return self._records  # type: ignore[no-any-return]

@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <numeric>
 #include <stdexcept>
 
 namespace srm {
@@ -12,13 +11,13 @@ namespace {
 
 // Marks the k steps with the largest values (n,), of equal ones the later.
 void choose_largest(const double* values, long n, long k, std::vector<char>& chosen) {
-    std::vector<long> steps(n);
-    std::iota(steps.begin(), steps.end(), 0L);
-    k = std::min(k, n);
-    std::nth_element(steps.begin(), steps.begin() + (k - 1), steps.end(), [&](long a, long b) {
-        return values[a] > values[b] || (values[a] == values[b] && a > b);
-    });
-    for (long i = 0; i < k; ++i) chosen[steps[i]] = 1;
+    if (k >= n) return std::fill(chosen.begin(), chosen.end(), 1);
+    std::vector<double> parted(values, values + n);
+    std::nth_element(parted.begin(), parted.begin() + (n - k), parted.end());
+    const double least = parted[n - k];
+    k -= std::count_if(parted.begin() + (n - k), parted.end(), [&](double x) { return x > least; });
+    for (long i = n; i-- > 0;)
+        if (values[i] > least || (values[i] == least && k-- > 0)) chosen[i] = 1;
 }
 
 // Ends of whole steps, as their numbers.

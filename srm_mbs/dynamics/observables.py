@@ -68,18 +68,19 @@ def conservative_elements(mechanism: MechanismData) -> dict[str, ForceKinematics
 
 
 class Invariants(NamedTuple):
-    """Closure errors and energies at n states, which show the error of a motion.
+    """Closure errors and energies along a motion, which show its error.
 
     Attributes
     ----------
-    position, rate : (n, rows)
-        As of :meth:`Observables.closure_errors`.
-    energies : (n, 2)
-        As of :meth:`Observables.energies`.
+    at_ends, within
+        Largest norm of each group of g - s, and then of each of G v - s', at the ends of steps and
+        at the other states.
+    energies : (k, 2) J
+        As of :meth:`Observables.energies`, at the ends of steps.
     """
 
-    position: FloatArray
-    rate: FloatArray
+    at_ends: list[float]
+    within: list[float]
     energies: FloatArray
 
 
@@ -99,9 +100,36 @@ class Observables:
         """g - s (n, rows) in m and rad, and G v - s' (n, rows), of all rows."""
         return constraint_errors(self.mechanism, t, q, v)
 
-    def invariants(self, t: FloatArray, q: FloatArray, v: FloatArray) -> Invariants:
-        """Closure errors and energies."""
-        return Invariants(*self.closure_errors(t, q, v), self.energies(q, v))
+    def invariants(
+        self,
+        t: FloatArray,
+        states: FloatArray,
+        ends: list[int],
+        whole: int,
+        order: list[int],
+        starts: list[int],
+    ) -> Invariants:
+        """Closure errors and energies at the states (n, nx) at the times ``t`` (n,).
+
+        Parameters
+        ----------
+        ends, whole
+            Indices of the states at ends of steps, and number of those, from the first, whose
+            closure errors count.
+        order, starts
+            Indices of the closure rows, one group after the other, and where the groups begin.
+        """
+        q, v = states[:, : self.mechanism.model.nq], states[:, self.mechanism.model.nq :]
+        at_end = np.isin(np.arange(whole), ends)
+        at_ends, within = (
+            [
+                norm
+                for errors in self.closure_errors(t[:whole][own], q[:whole][own], v[:whole][own])
+                for norm in self.largest_norms(errors, order, starts)
+            ]
+            for own in (at_end, ~at_end)
+        )
+        return Invariants(at_ends, within, self.energies(q[ends], v[ends]))
 
     def jacobians(self, t: FloatArray, q: FloatArray) -> FloatArray:
         """G (n, rows, nv) of all rows; with drives [G, -s'] (n, rows, nv + 1)."""

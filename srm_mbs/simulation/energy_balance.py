@@ -117,7 +117,6 @@ class BalancedRun(Protocol):
 
     mechanism: Mechanism
     scheme: ButcherTableau
-    t_eval: FloatArray | None
 
     @property
     def t(self) -> FloatArray:
@@ -130,6 +129,10 @@ class BalancedRun(Protocol):
     @property
     def v(self) -> FloatArray:
         """Velocities (n, nv)."""
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Start and end (s) of the run."""
 
     @property
     def steps(self) -> StepData:
@@ -151,6 +154,9 @@ class BalancedRun(Protocol):
     def energy_balance(self) -> EnergyBalance:
         """The balance at ``t``."""
 
+    def element_works(self, t: FloatArray) -> Powers | None:
+        """Works (n,) J up to ``t`` (n,) s by the stages of the run, of the kernel."""
+
     @property
     def drive_rates(self) -> Mapping[str, FloatArray]:
         """Prescribed rate of each drive (n,), m/s or rad/s."""
@@ -167,10 +173,8 @@ class Nodes:
     """
 
     def __init__(self, solution: BalancedRun, system: _System, ends: FloatArray) -> None:
-        self._run, self._ends = solution, ends
-        # Dampers do all the work, and no force has a kink.
-        acting = system.controlled or system.has_friction
-        self._smooth = not acting and _dampers_alone(system.mechanism)
+        self._run, self._ends, self._lengths = solution, ends, ends[1:] - ends[:-1]
+        self._smooth = _is_smooth(system)
         self.observables = solution.observables
         self._scheme = solution.scheme.member(False)
         self._stages = np.flatnonzero(self._scheme.b)
@@ -183,7 +187,7 @@ class Nodes:
         if not (self._smooth and len(self._scheme.dense.extra_c) and steps.count):
             return out
         with_stages = self._run.steps_with_stages
-        if self._run.t_eval is None and steps.stop is None:  # all intervals are steps
+        if np.array_equal(ends, steps.times):  # all intervals are steps
             return np.where(with_stages, np.arange(steps.count), out)
         step = np.clip(np.searchsorted(steps.times, ends[:-1]), 0, steps.count - 1)
         whole = (steps.times[step] == ends[:-1]) & (steps.times[step + 1] == ends[1:])
@@ -200,7 +204,7 @@ class Nodes:
         read, (points, _) = self._steps < 0, self._gauss
         if not np.logical_or.reduce(read):
             return np.zeros(0)
-        starts, lengths = self._ends[:-1][read], np.diff(self._ends)[read]
+        starts, lengths = self._ends[:-1][read], self._lengths[read]
         return (starts[:, None] + np.outer(lengths, 0.5 * (points + 1.0))).ravel()
 
     @property
@@ -240,12 +244,12 @@ class Nodes:
             return {name: power.ravel() for name, power in parts[0].items()}
         return {name: np.concatenate([part[name].ravel() for part in parts]) for name in parts[0]}
 
-    def works(self, powers: Powers) -> Powers:
-        """Work (n + 1,) J up to each of the ends by each of the ``powers`` (k,) W."""
+    def works(self, powers: Powers, place: IndexArray) -> Powers:
+        """Work (m,) J up to the ends at ``place`` (m,) by each of the ``powers`` (k,) W."""
         if not powers:
             return {}
         power = np.array(list(powers.values()))
-        at_stages, lengths = self._steps >= 0, np.diff(self._ends)
+        at_stages, lengths = self._steps >= 0, self._lengths
         nodes = len(self._started) * len(self._stages)
         out = np.zeros((len(powers), len(self._ends)))
         gained = out[:, 1:]
@@ -256,7 +260,7 @@ class Nodes:
             if own.size:
                 mean = own.reshape(len(own), -1, len(weights)) @ weights
                 gained[:, chosen] = lengths[chosen] * mean
-        return dict(zip(powers, np.cumsum(out, axis=1)))
+        return dict(zip(powers, np.add.accumulate(out, axis=1)[:, place]))
 
 
 def _controller(nodes: Nodes, system: _System) -> Powers:
@@ -282,7 +286,11 @@ def _elements(nodes: Nodes, system: _System) -> Powers:
     potential."""
     if not working_elements(system.mechanism):
         return {}
-    return {f"force {name}": power for name, power in nodes.element_powers().items()}
+    return _of_forces(nodes.element_powers())
+
+
+def _of_forces(elements: Powers) -> Powers:
+    return {f"force {name}": values for name, values in elements.items()}
 
 
 def _drives(nodes: Nodes, system: _System) -> Powers:
@@ -302,6 +310,12 @@ TERMS: tuple[Callable[[Nodes, _System], Powers], ...] = (
 """Everything that does work beside the potentials; what is new is added here."""
 
 
+def _is_smooth(system: _System) -> bool:
+    """Whether dampers do all the work, and no force has a kink."""
+    acting = system.controlled or system.has_friction
+    return not acting and _dampers_alone(system.mechanism)
+
+
 @per_model
 def _dampers_alone(mechanism: Mechanism) -> bool:
     """Whether all force elements are springs and dampers without a kink, and no drive moves it."""
@@ -310,17 +324,23 @@ def _dampers_alone(mechanism: Mechanism) -> bool:
     )
 
 
-def energy_balance(solution: BalancedRun, system: _System) -> EnergyBalance:
-    """The balance of ``solution`` at its times; ``system`` is the one that made it.
+def energy_balance(
+    solution: BalancedRun, system: _System, t: FloatArray, energies: FloatArray
+) -> EnergyBalance:
+    """The balance of ``solution`` at times (n,) s; ``system`` is the one that made it.
+
+    Parameters
+    ----------
+    t, energies
+        The times, and kinetic and potential energy (n, 2) J there.
 
     Raises
     ------
     EvaluationError
         If a force cannot be evaluated.
     """
-    t, energies, times = solution.t, solution.energies, solution.steps.times
     first = energies[:1]
-    if not len(t) or t[0] != times[0]:
+    if not len(t) or t[0] != solution.span[0]:
         nq, states = solution.mechanism.model.nq, solution.steps.states[:1]
         first = solution.observables.energies(states[:, :nq], states[:, nq:])
     works = _works(solution, system, t) if _acted_on(system) else {}
@@ -339,16 +359,22 @@ def _acted_on(system: _System) -> bool:
 
 
 def _works(solution: BalancedRun, system: _System, t: FloatArray) -> Powers:
-    """The works (n,) J up to the times ``t`` (n,), of which a run without output times has all."""
-    place: IndexArray | slice = slice(None)
-    ends = t
-    if solution.t_eval is not None:  # steps are integrated whole
-        times = solution.steps.times
-        ends = np.unique(np.concatenate([times[:1], times[times < solution.steps.end], t]))
+    """The works (n,) J up to the times ``t`` (n,)."""
+    scheme = solution.scheme.member(False)
+    by_stages = scheme.implicit is None and len(scheme.dense.extra_c) > 0
+    if by_stages and _is_smooth(system) and not system.is_damped:
+        found = solution.element_works(t)
+        if found is not None:
+            return _of_forces(found)
+    steps = solution.steps
+    ends = np.append(steps.times[:-1], steps.end)
+    place = np.searchsorted(ends, t)
+    if not np.array_equal(ends[np.minimum(place, steps.count)], t):  # steps are integrated whole
+        ends = np.unique(np.concatenate([ends[:-1], t]))
         place = np.searchsorted(ends, t)
     nodes = Nodes(solution, system, ends)
     powers = {name: one for term in TERMS for name, one in term(nodes, system).items()}
-    return {name: work[place] for name, work in nodes.works(powers).items()}
+    return nodes.works(powers, place)
 
 
 def _largest(values: FloatArray) -> float:

@@ -15,7 +15,7 @@ from srm_mbs.dynamics.constraints.reactions import Reactions
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.dynamics.observables import Invariants, Observables
+from srm_mbs.dynamics.observables import Observables
 from srm_mbs.dynamics.point_motion import (
     Place,
     PointMotion,
@@ -36,8 +36,10 @@ from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import Occurrence
 from srm_mbs.integration.kernel import dense_output as kernel_steps
 from srm_mbs.integration.kernel.backend import COMPILED
+from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.observables import CompiledObservables
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.run_samples import RunSamples, run_samples
 from srm_mbs.integration.singular_passages import (
     Bifurcation,
     Crossing,
@@ -46,7 +48,7 @@ from srm_mbs.integration.singular_passages import (
 )
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.lazy import cached_property
-from srm_mbs.simulation.energy_balance import EnergyBalance, energy_balance
+from srm_mbs.simulation.energy_balance import EnergyBalance, Powers, energy_balance
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.streamed_output import StreamedOutput
 
@@ -173,6 +175,8 @@ class RunData(Protocol):
     steps, dense
         The accepted steps and their dense output; None of a run with output times that did not
         keep them.
+    span
+        Start and end (s) of the steps that the run keeps.
     nodes
         Times (n + 1,) s and states (n + 1, nx) at the ends of the steps, as
         :meth:`~srm_mbs.integration.dense_output.DenseOutput.nodes`, of a run that has them.
@@ -191,6 +195,8 @@ class RunData(Protocol):
     def steps(self) -> StepData | None: ...
     @property
     def dense(self) -> DenseOutput | None: ...
+    @property
+    def span(self) -> tuple[float, float]: ...
     @property
     def nodes(self) -> tuple[FloatArray, FloatArray]: ...
     @property
@@ -226,6 +232,11 @@ class KnownRunData:
     output: StreamedOutput | None = None
     again: Callable[[], SimulationResult] | None = None
     bifurcations: tuple[Bifurcation, ...] | None = None
+
+    @property
+    def span(self) -> tuple[float, float]:
+        steps = cast(StepData, self.steps)
+        return float(steps.times[0]), steps.end
 
     @property
     def nodes(self) -> tuple[FloatArray, FloatArray]:
@@ -268,7 +279,6 @@ class SimulationResult(RunOutcome):
     """
 
     request: RunOptions | None = None
-    _invariants: Invariants | None = None
 
     def __init__(
         self,
@@ -408,15 +418,11 @@ class SimulationResult(RunOutcome):
             )
         return run.again()._run
 
-    @property
+    @cached_property
     def span(self) -> tuple[float, float]:
         """Start and end (s) of the run, whatever ``t`` holds."""
         output = self._run.output
-        if output is not None:
-            return output.span
-        if self.t_eval is None:
-            return float(self.t[0]), float(self.t[-1])
-        return super().span
+        return self._run.span if output is None else output.span
 
     @property
     def held(self) -> HeldForce | None:
@@ -496,6 +502,12 @@ class SimulationResult(RunOutcome):
         dense = self._dense
         return dense(t) if allowed is None else dense.between_ends(t, allowed)
 
+    def samples(self) -> RunSamples:
+        """Samples that show the accuracy of a run of one segment, whatever ``t`` holds."""
+        dense, unit = self._dense, self.mechanism.structure.units.state
+        found = dense.samples(unit) if isinstance(dense, CompiledDenseOutput) else None
+        return found or run_samples(self.scheme, self.steps, dense, unit)
+
     def unwrapped(self, name: str, t: FloatArray, states: FloatArray) -> FloatArray:
         """Angle (k,) rad of a joint that is stored as cosine and sine, with the ``states``
         (k, nq + nv) at the times ``t`` (k,) s."""
@@ -559,23 +571,13 @@ class SimulationResult(RunOutcome):
     def drift(self) -> FloatArray:
         """Closure errors (n, 2): ||g - s|| (m, rad) and ||G v - s'|| (m/s, rad/s), s the motion of
         the drives; all rows, unscaled."""
-        known = self._invariants
-        g, c = known[:2] if known else self.observables.closure_errors(self.t, self.q, self.v)
+        g, c = self.observables.closure_errors(self.t, self.q, self.v)
         return np.column_stack([np.linalg.norm(g, axis=1), np.linalg.norm(c, axis=1)])
-
-    @property
-    def invariants(self) -> Invariants:
-        """Closure errors of all rows, unscaled, and energies at ``t``, which take one pass over the
-        bodies together."""
-        if self._invariants is None:
-            self._invariants = self.observables.invariants(self.t, self.q, self.v)
-        return self._invariants
 
     @property
     def energies(self) -> FloatArray:
         """Kinetic and potential energy (n, 2) J."""
-        known = self._invariants
-        return known.energies if known else self.observables.energies(self.q, self.v)
+        return self.observables.energies(self.q, self.v)
 
     @cached_property
     def energy(self) -> FloatArray:
@@ -635,6 +637,15 @@ class SimulationResult(RunOutcome):
         close = kernel_steps.close_to_singular if self._by_kernel else close_to_singular
         return self.steps.with_stages(self.scheme, close)
 
+    def element_works(self, t: FloatArray) -> Powers | None:
+        """Work (n,) J of each force element, but that of its potential, up to the times ``t`` (n,)
+        s, by the scheme of the run at its own stages; None where it has to be integrated step by
+        step."""
+        dense, observables = self._dense, self.observables
+        if isinstance(dense, CompiledDenseOutput) and isinstance(observables, CompiledObservables):
+            return dense.element_works(observables, t)
+        return None
+
     @cached_property
     def energy_balance(self) -> EnergyBalance:
         """Energies and the works of everything that acts; see
@@ -645,8 +656,13 @@ class SimulationResult(RunOutcome):
         InputError
             For a loaded run that had a controller or a ``UserForce``.
         """
+        return self.balance_at(self.t, self.energies)
+
+    def balance_at(self, t: FloatArray, energies: FloatArray) -> EnergyBalance:
+        """As :attr:`energy_balance` at the times ``t`` (n,) s, ascending, with the energies (n, 2)
+        there."""
         self._need_controller("energy balance")
-        return energy_balance(self, self._system)
+        return energy_balance(self, self._system, t, energies)
 
     def _need_controller(self, what: str) -> None:
         system = self._system

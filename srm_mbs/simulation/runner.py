@@ -943,6 +943,13 @@ class FinishedRun:
     def steps(self) -> StepData | None:
         return self._record.data(self._options.method.scheme, self._system.tangent_size)
 
+    @property
+    def span(self) -> tuple[float, float]:
+        if self._summary is not None:
+            return cast(CompiledRecord, self._record).span()
+        steps = cast(StepData, self.steps)
+        return float(steps.times[0]), steps.end
+
     @cached_property
     def nodes(self) -> tuple[FloatArray, FloatArray]:
         record = self._record
@@ -983,7 +990,7 @@ class FinishedRun:
     @cached_property
     def stats(self) -> Statistics:
         if self._summary is not None:
-            steps, zone_steps = self._summary[:2]
+            steps, zone_steps = self._summary.steps, self._summary.zone_steps
         elif self.output is not None:
             steps, zone_steps = self.output.count, self.output.zone_steps
         else:

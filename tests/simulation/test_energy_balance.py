@@ -271,3 +271,30 @@ def test_the_work_of_dampers_takes_the_stages_of_the_run_and_no_dense_output(
     for name, work in balance.works.items():
         assert np.abs(work - by_gauss.works[name][::2]).max() < 1e-10 * balance.scale
     assert balance.relative < 1e-10
+
+
+@pytest.mark.parametrize("name", ["stewart_platform", "delta_robot"])
+def test_works_of_dampers_by_the_kernel_are_those_of_the_powers_at_the_stages(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = srm.simulate(load(name), 5.0)
+    ends = run.t[::3]
+    found = run.element_works(ends)
+    assert (found is None) == (run.backend == "python")
+    some = run.at(ends).energy_balance.works
+    monkeypatch.setattr(type(run), "element_works", lambda run, t: None)
+    for force, expected in run.energy_balance.works.items():
+        rounding = 1e-14 * np.abs(expected).max()
+        np.testing.assert_allclose(some[force], expected[::3], atol=rounding, rtol=1e-13)
+
+
+def test_works_are_not_summed_over_stages_where_one_cannot_be_or_a_time_lies_within_a_step() -> (
+    None
+):
+    run = srm.simulate(load("stewart_platform"), 1.0)
+    assert run.element_works(0.5 * run.t[1:2]) is None
+    stopped = srm.simulate(
+        load("stewart_platform"), 1.0, events=srm.Event(lambda t, q, v: t - 0.51, terminal=True)
+    )
+    assert stopped.element_works(stopped.t) is None
+    assert stopped.energy_balance.relative < 1e-6

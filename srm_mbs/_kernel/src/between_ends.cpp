@@ -69,6 +69,7 @@ bool DenseOutput::near_ends(const System& system, double theta, const double* al
 // the neighbouring steps needs them.
 const double* DenseOutput::coordinate_rate(const System& system, long node, long last,
                                            EndRates& rates) const {
+    if (nx_ == n_) return rate_at(node, last);  // rates are those of the coordinates
     if (last != rates.last) {  // of a breakpoint, the rates on the other side
         rates.last = last;
         rates.known.assign(static_cast<std::size_t>(steps_.count) + 1, 0);

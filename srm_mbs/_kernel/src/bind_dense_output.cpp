@@ -7,6 +7,7 @@
 
 #include "binding.hpp"
 #include "dense.hpp"
+#include "run_samples.hpp"
 #include "sigma_dips.hpp"
 #include "turns.hpp"
 
@@ -22,6 +23,7 @@ using Indices = nb::ndarray<const long, nb::c_contig, nb::device::cpu>;
     field(Array, rates)             /* (k, rates per step, n) */                      \
     field(Array, corrections)       /* (k, n), or (k, 0) without closures */          \
     field(Array, sigmas)            /* (k, stages + 1) */                             \
+    field(Array, error_ratios)      /* (k,) */                                        \
     field(Array, stiff)             /* (k,), not 0: of the scheme for stiff problems */ \
     field(Array, end_rate)          /* (n,) */                                        \
     field(Array, break_rates)       /* (breaks, n) */                                 \
@@ -42,6 +44,7 @@ struct PySteps {
         expect("rates", rates, {k, rates.ndim() == 3 ? rates.shape(1) : 0, n});
         expect("corrections", corrections, {k, corrected ? n : 0});
         expect("sigmas", sigmas, {k, abscissae});
+        expect("error_ratios", error_ratios, {k});
         expect("stiff", stiff, {k});
         expect("end_rate", end_rate, {n});
         expect("break_rates", break_rates, {breaks.size(), n});
@@ -55,6 +58,7 @@ struct PySteps {
         out.rates = rates.data();
         out.corrections = corrections.data();
         out.sigmas = sigmas.data();
+        out.error_ratios = error_ratios.data();
         out.end_rate = end_rate.data();
         out.breaks = breaks;
         out.break_rates = break_rates.data();
@@ -96,6 +100,7 @@ StepArrays arrays(const PyRecords& records, std::optional<double> stop) {
     out.rates = r.rates.data();
     out.corrections = r.corrections.data();
     out.sigmas = r.sigmas.data();
+    out.error_ratios = r.error_ratios.data();
     out.end_rate = records.end_rate.data();
     out.stiff.assign(r.stiff.begin(), r.stiff.end());
     out.in_zone.assign(r.ranks.size(), 0);
@@ -137,6 +142,58 @@ struct PyDense {
         // With the interpreter's lock held: threads may read one solution, and share its workspace.
         dense.states(system, t.data(), static_cast<long>(k), out.data());
         return owned_array(std::move(out), {k, nx});
+    }
+
+    // RunSamples of run_samples.py.
+    nb::tuple samples(nb::handle owner, const SampleRules& rules, nb::handle unit) {
+        System& system = system_in(owner);
+        const std::vector<double> units = numbers(unit, 2 * system.nv, "unit");
+        SampleTimes found = sample_times(dense.steps(), rules, units, dense.takes_stages());
+        const std::size_t k = found.t.size();
+        std::vector<double> out(k * nx);
+        dense.states(system, found.t.data(), static_cast<long>(k), out.data());
+        return nb::make_tuple(owned_array(std::move(found.t)),
+                              owned_array(std::move(out), {k, nx}), found.ends, found.whole);
+    }
+
+    // Works (k, elements) of `elements` from the start to the ends t (k,) of steps, ascending, by the
+    // stages with these rows of A (stages, s), c and weights b; None where t has other times, or a
+    // step has no stages on the motion.  owner: a system of all rows.
+    nb::object works(nb::handle owner, const Array& t, const std::vector<ForceElement>& elements,
+                     const Array& A, const Array& b, const Array& c) {
+        System& system = system_in(owner);
+        const StepArrays& all = dense.steps();
+        const std::size_t stages = c.size(), m = elements.size(), width = all.width;
+        if (!stages || b.size() != stages || A.size() % stages || A.size() / stages > width)
+            throw nb::value_error("A, b or c has another shape");
+        const StageArrays arrays{all.times, all.states, all.rates, A.data(),
+                                 c.data(),  width,      A.size() / stages, stages};
+        const std::size_t n = t.size();
+        std::vector<long> steps;
+        for (long step = 0; step < all.count && n && all.times[step] < t.data()[n - 1]; ++step) {
+            if (!dense.has_stages(step)) return nb::none();
+            steps.push_back(step);
+        }
+        std::vector<double> work(m, 0.0), powers(steps.size() * stages * m), out;
+        system.stage_powers(steps, arrays, system.separate(elements), powers.data());
+        const double* power = powers.data();
+        for (std::size_t step = 0, end = 0; end < n; ++step, power += stages * m) {
+            if (all.times[step] == t.data()[end]) {
+                out.insert(out.end(), work.begin(), work.end());
+                ++end;
+            }
+            if (step == steps.size()) {
+                if (end < n) return nb::none();
+                break;
+            }
+            const double h = all.times[step + 1] - all.times[step];
+            for (std::size_t e = 0; e < m; ++e) {
+                double mean = 0.0;
+                for (std::size_t i = 0; i < stages; ++i) mean += b.data()[i] * power[i * m + e];
+                work[e] += h * mean;
+            }
+        }
+        return owned_array(std::move(out), {n, m});
     }
 
     nb::object between_ends(nb::handle owner, const Array& t, const Array& allowed) {
@@ -213,16 +270,16 @@ nb::object dips_of_records(const DipSearch& search, const PyRecords& records,
     return dips_of(search, steps.times, steps.sigmas, steps.count, records.stages, steps.end);
 }
 
-// Of each step with sigma (n, abscissae) whether its stages lie close to a singular configuration.
-std::vector<bool> py_close_to_singular(const std::vector<double>& abscissae, const Array& sigmas,
+// Of each step with sigma (n, abscissae) 1 if its stages lie close to a singular configuration, else 0.
+nb::object py_close_to_singular(const std::vector<double>& abscissae, const Array& sigmas,
                                        const DenseConstants& constants) {
     if (sigmas.ndim() != 2 || sigmas.shape(1) != abscissae.size())
         throw nb::value_error("sigmas has another shape");
-    std::vector<bool> out(sigmas.shape(0));
+    std::vector<double> out(sigmas.shape(0));
     for (std::size_t i = 0; i < out.size(); ++i)
         out[i] = close_to_singular(abscissae, sigmas.data() + i * abscissae.size(),
                                    constants.close, constants.branch_below);
-    return out;
+    return owned_array(std::move(out));
 }
 
 }  // namespace
@@ -242,6 +299,8 @@ void bind_dense_output(nb::module_& m) {
                       std::optional<double>>(),
              nb::arg("schemes"), nb::arg("constants"), nb::arg("records"), nb::arg("stop").none())
         .def("states", &PyDense::states)
+        .def("samples", &PyDense::samples)
+        .def("works", &PyDense::works)
         .def("between_ends", &PyDense::between_ends)
         .def("turns", &PyDense::turns);
 }

@@ -480,17 +480,21 @@ void bind_run(nb::module_& m) {
         return owned_array(std::move(out), {5, r.ranks.size()});
     });
     records
-        // Numbers of steps and of those with a zone, the least sigma, whether a stage kept the
-        // normals of the last node, and whether the problem was found to be stiff.
-        .def_prop_ro("summary",
+        .def_prop_ro("span",
                      [](const PyRecords& r) {
-                         const StepRecords& s = r.records;
-                         double least = infinity;
-                         for (double sigma : s.sigmas)
-                             if (sigma < least) least = sigma;
-                         return nb::make_tuple(s.ranks.size(), s.zones.size(), least, any(s.held),
-                                               any(s.stiff));
+                         return nb::make_tuple(r.records.times.front(), r.records.times.back());
                      })
+        // StepSummary of driver.py.
+        .def_prop_ro("steps", [](const PyRecords& r) { return r.records.ranks.size(); })
+        .def_prop_ro("zone_steps", [](const PyRecords& r) { return r.records.zones.size(); })
+        .def_prop_ro("least_sigma",
+                     [](const PyRecords& r) {
+                         double least = infinity;
+                         for (double sigma : r.records.sigmas)
+                             if (sigma < least) least = sigma;
+                         return least;
+                     })
+        .def_prop_ro("held", [](const PyRecords& r) { return any(r.records.held); })
         .def_prop_ro("stiff", [](const PyRecords& r) { return any(r.records.stiff); })
         .def_prop_ro("break_count", [](const PyRecords& r) { return r.records.breaks.size(); })
         // Whether dense output needs no more than the records: there are steps, but no breakpoint

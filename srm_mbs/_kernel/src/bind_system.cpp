@@ -159,26 +159,58 @@ struct PySystem {
         return n;
     }
 
-    // g - s and G v - s' (n, rows); with_energies: and kinetic and potential energy (n, 2).
-    nb::tuple closure_errors(const Array& t, const Array& states, bool with_energies) {
+    // g - s and G v - s' (n, rows).
+    nb::tuple closure_errors(const Array& t, const Array& states) {
         const std::size_t n = count_of(t, states, state_size()), nx = state_size();
         const auto rows = static_cast<std::size_t>(system->rows());
-        std::vector<double> g(n * rows), rates(n * rows), energies(with_energies ? 2 * n : 0);
+        std::vector<double> g(n * rows), rates(n * rows);
         const double *times = t.data(), *x = states.data();
         on_states(n, [&] {
-            for (std::size_t i = 0; i < n; ++i) {
-                const double* const state = x + i * nx;
-                system->closure_errors(times[i], state, g.data() + i * rows,
+            for (std::size_t i = 0; i < n; ++i)
+                system->closure_errors(times[i], x + i * nx, g.data() + i * rows,
                                        rates.data() + i * rows);
-                if (!with_energies) continue;
-                const auto found = system->energies(state, true);
-                std::copy(found.begin(), found.end(), energies.begin() + 2 * i);
+        });
+        return nb::make_tuple(owned_array(std::move(g), {n, rows}),
+                              owned_array(std::move(rates), {n, rows}));
+    }
+
+    // Invariants of dynamics/observables.py: the largest norms (LargestNorms) of groups of g - s and
+    // of G v - s' at those of the first `whole` states that are `ends` of steps, the same at the
+    // others, and the energies (k, 2) at all ends.
+    nb::tuple invariants(const Array& t, const Array& states, const std::vector<std::size_t>& ends,
+                         std::size_t whole, const std::vector<int>& order,
+                         const std::vector<int>& starts) {
+        const std::size_t n = count_of(t, states, state_size()), nx = state_size();
+        const auto rows = static_cast<std::size_t>(system->rows());
+        if (whole > n || (!ends.empty() && ends.back() >= n) ||
+            !std::is_sorted(ends.begin(), ends.end()))
+            throw nb::value_error("whole or ends is not of the states");
+        std::vector<double> g(rows), rates(rows), energies;
+        const LargestNorms none(order, starts, rows);
+        LargestNorms norms[2][2] = {{none, none}, {none, none}};
+        const double *times = t.data(), *x = states.data();
+        on_states(n, [&] {
+            auto end = ends.begin();
+            for (std::size_t i = 0; i < n; ++i) {
+                const bool at_end = end != ends.end() && *end == i;
+                system->closure_errors(times[i], x + i * nx, g.data(), rates.data());
+                if (i < whole) {
+                    norms[at_end][0].take(g.data());
+                    norms[at_end][1].take(rates.data());
+                }
+                if (!at_end) continue;
+                const auto found = system->energies(x + i * nx, true);
+                energies.insert(energies.end(), found.begin(), found.end());
+                ++end;
             }
         });
-        const nb::object errors = owned_array(std::move(g), {n, rows});
-        const nb::object of_rates = owned_array(std::move(rates), {n, rows});
-        if (!with_energies) return nb::make_tuple(errors, of_rates);
-        return nb::make_tuple(errors, of_rates, owned_array(std::move(energies), {n, 2}));
+        const auto largest = [](const LargestNorms (&of)[2]) {
+            std::vector<double> out = of[0].norms();
+            for (const double norm : of[1].norms()) out.push_back(norm);
+            return out;
+        };
+        return nb::make_tuple(largest(norms[1]), largest(norms[0]),
+                              owned_array(std::move(energies), {ends.size(), 2}));
     }
 
     // The largest |g - s| and |G v - s'| at q (nq,) and v (nv,), over the units (rows,) of the rows;
@@ -618,8 +650,9 @@ void bind_system(nb::module_& m) {
              [](PySystem& s, double t, const Array& state) {
                  s.system->begin_step(t, vector_of(state, s.state_size(), "state"));
              })
-        .def("closure_errors", &PySystem::closure_errors, nb::arg("t"), nb::arg("states"),
-             nb::arg("with_energies") = false)
+        .def("closure_errors", &PySystem::closure_errors, nb::arg("t"), nb::arg("states"))
+        .def("invariants", &PySystem::invariants, nb::arg("t"), nb::arg("states"), nb::arg("ends"),
+             nb::arg("whole"), nb::arg("order"), nb::arg("starts"))
         .def("largest_errors", &PySystem::largest_errors, nb::arg("t"), nb::arg("q"), nb::arg("v"),
              nb::arg("unit"))
         .def("jacobians", &PySystem::jacobians)

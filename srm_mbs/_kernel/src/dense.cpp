@@ -29,8 +29,6 @@ DenseOutput::DenseOutput(int nq, int nv, const std::vector<SchemeDense>& schemes
       steps_(std::move(steps)),
       n_(2 * nv),
       nx_(nq + nv),
-      extra_(steps_.count),
-      polynomials_(steps_.count),
       places_(steps_.count, Place::unknown),
       delta_(n_),
       x_(std::max(nx_, n_)),
@@ -114,6 +112,13 @@ bool DenseOutput::close_to_singular(long step) const {
                                   constants_.close, constants_.branch_below);
 }
 
+bool DenseOutput::has_stages(long step) const {
+    const std::vector<double>& abscissae = schemes_[0].abscissae;
+    return !steps_.in_zone[step] && !steps_.stiff[step] &&
+           !srm::close_to_singular(abscissae, steps_.sigmas + step * abscissae.size(),
+                                   constants_.close, constants_.branch_below);
+}
+
 bool close_to_singular(const std::vector<double>& abscissae, const double* sigmas, double close,
                        double branch_below) {
     const int width = static_cast<int>(abscissae.size());
@@ -138,9 +143,11 @@ void Extension::weights(double theta, double* out) const {
 }
 
 const std::vector<double>& DenseOutput::extra_rates(System& system, long step, double h) {
-    std::vector<double>& kept = extra_[step];
+    static const std::vector<double> none;
     const Extension& extension = scheme_of(step).extension;
-    if (!kept.empty() || steps_.width >= extension.n_rates) return kept;
+    if (steps_.width >= extension.n_rates) return none;
+    std::vector<double>& kept = extra_[step];
+    if (!kept.empty()) return kept;
     std::vector<double> out;  // kept only once all of them could be evaluated
     const double* rates = steps_.rates + step * steps_.width * n_;
     rate_.resize(n_);

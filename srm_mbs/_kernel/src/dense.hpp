@@ -3,6 +3,7 @@
 
 #include <limits>
 #include <memory>
+#include <unordered_map>
 #include <utility>
 #include <vector>
 
@@ -54,7 +55,7 @@ struct StepArrays {
     double end = 0.0;        // of the run (s)
     int width = 0;           // rates per step
     bool corrected = false;
-    const double *times, *states, *rates, *corrections, *sigmas, *end_rate;
+    const double *times, *states, *rates, *corrections, *sigmas, *error_ratios, *end_rate;
     std::vector<char> in_zone;  // (count,)
     const double* layers = nullptr;  // (count, 2), time and width (s) of the layer; width 0: none
     std::vector<char> stiff;    // (count,), of the scheme for stiff problems, if there is one
@@ -86,6 +87,11 @@ public:
     const StepArrays& steps() const { return steps_; }
     // Numbers of sigma in each step.
     long sigma_width() const { return static_cast<long>(schemes_[0].abscissae.size()); }
+    // StepData.with_stages for one step of an explicit scheme.
+    bool has_stages(long step) const;
+    // Whether a step takes further stages to be read.
+    bool takes_stages() const { return schemes_[0].extension.extra_stages() > 0; }
+
     static constexpr int most_nodes = 16;  // of a polynomial
 
 private:
@@ -155,9 +161,9 @@ private:
     DenseConstants constants_;
     StepArrays steps_;
     const int n_, nx_;
-    // Of each step, empty until it needs them.
-    std::vector<std::vector<double>> extra_;
-    std::vector<Polynomial> polynomials_;
+    // Of the steps that needed them, which of long runs are few.
+    std::unordered_map<long, std::vector<double>> extra_;
+    std::unordered_map<long, Polynomial> polynomials_;
     enum class Place : char { unknown, regular, near_singular };
     std::vector<Place> places_;
     std::vector<double> delta_, x_, weights_, near_, rate_, points_, slopes_, differences_;

@@ -9,6 +9,7 @@
 #include "interpreter.hpp"
 #include "manifold.hpp"
 #include "regular_start.hpp"
+#include "run_samples.hpp"
 #include "separated_rows.hpp"
 #include "sigma_dips.hpp"
 #include "turns.hpp"
@@ -45,6 +46,7 @@ void bind_structs(nb::module_& m) {
     bind_struct<Extension>(m, "Extension");
     bind_struct<SchemeDense>(m, "SchemeDense");
     bind_struct<DenseConstants>(m, "DenseConstants");
+    bind_struct<SampleRules>(m, "SampleRules");
     bind_struct<DipSearch>(m, "DipSearch");
     bind_struct<TurnSearch>(m, "TurnSearch");
     bind_struct<EventConstants>(m, "EventConstants");

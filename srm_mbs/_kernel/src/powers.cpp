@@ -31,17 +31,20 @@ SeparateElements System::separate(const std::vector<ForceElement>& elements) con
     for (const ForceElement& e : elements) {
         check_indices(e, nq, nv, model.njoints);
         out.each.push_back({e});
+        std::vector<int> acted_on;
         if (on_bodies(e)) {
             for (const int body : {e.a.joint, e.b.joint})
                 for (const auto joint : model.supports[body])
                     if (joint > 0) out.joints.push_back(static_cast<int>(joint));
         } else if (e.kind == ForceKind::coupling_spring) {
-            out.coordinates.insert(out.coordinates.end(), e.columns.begin(), e.columns.end());
+            acted_on = e.columns;
         } else {
             const int count =
                 e.kind == ForceKind::joint_torque ? static_cast<int>(e.numbers.size()) : 1;
-            for (int i = 0; i < count; ++i) out.coordinates.push_back(e.in_v + i);
+            for (int i = 0; i < count; ++i) acted_on.push_back(e.in_v + i);
         }
+        out.coordinates.insert(out.coordinates.end(), acted_on.begin(), acted_on.end());
+        out.acted_on.push_back(std::move(acted_on));
     }
     sort_unique(out.joints);
     for (const int joint : out.joints)
@@ -69,7 +72,9 @@ void System::powers(const double* t, const double* states, std::size_t n,
         // Bodies that move tell the power of a wrench, which takes no Jacobian.
         if (bodies) pinocchio_model::move_bodies(w, resting ? nullptr : &elements.joints);
         if (bodies && resting) pinocchio::computeJointJacobians(w.model, w.data);
-        for (const std::vector<ForceElement>& one : elements.each) {
+        for (std::size_t k = 0; k < elements.each.size(); ++k) {
+            const std::vector<ForceElement>& one = elements.each[k];
+            const std::vector<int>& acted_on = elements.acted_on[k];
             const ForceElement& e = one.front();
             if (!resting && e.kind == ForceKind::spring_damper) {
                 *out++ = spring_damper_power(e, data_.coincident, w);
@@ -79,14 +84,22 @@ void System::powers(const double* t, const double* states, std::size_t n,
             if (by_wrenches)
                 for (const int joint : {e.a.joint, e.b.joint})
                     std::fill_n(&wrenches[6 * joint], 6, 0.0);
-            else
+            else if (acted_on.empty())
                 std::fill(f_.begin(), f_.end(), 0.0);
+            else
+                for (const int j : acted_on) f_[j] = 0.0;
             add_forces(one, data_.coincident, w, t[i], states, w.v.data(), none,
                        by_wrenches ? nullptr : f_.data(), nullptr,
                        by_wrenches ? wrenches.data() : nullptr);
-            if (!by_wrenches) *out++ = dot(f_.data(), v, nv);
-            else *out++ = power_on(e.a.joint) +
-                          (e.a.joint == e.b.joint ? 0.0 : power_on(e.b.joint));
+            double power = 0.0;
+            if (by_wrenches)
+                power = power_on(e.a.joint) +
+                        (e.a.joint == e.b.joint ? 0.0 : power_on(e.b.joint));
+            else if (acted_on.empty())
+                power = dot(f_.data(), v, nv);
+            else
+                for (const int j : acted_on) power += f_[j] * v[j];
+            *out++ = power;
         }
     }
 }

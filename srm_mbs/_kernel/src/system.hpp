@@ -156,6 +156,7 @@ struct RowBlock {
 // Force elements whose powers are separate, each a list of its own.
 struct SeparateElements {
     std::vector<std::vector<ForceElement>> each;
+    std::vector<std::vector<int>> acted_on;  // velocity indices; none if it acts on bodies
     // The joints that move the bodies on which they act, ascending, and the velocity indices of all
     // coordinates on which their powers depend.
     std::vector<int> joints, coordinates;

@@ -14,9 +14,14 @@ from srm_mbs.analysis.accuracy.assessment import (
     assess_errors,
     assess_status,
 )
-from srm_mbs.analysis.accuracy.conservation import Drift, EnergyError, drift_of, energy_error
+from srm_mbs.analysis.accuracy.conservation import (
+    Drift,
+    EnergyError,
+    drift_of,
+    energy_error,
+    invariants_of,
+)
 from srm_mbs.analysis.accuracy.error_estimate import ErrorEstimate, checked_settings, estimate_error
-from srm_mbs.analysis.accuracy.samples import at_ends, sampled
 from srm_mbs.model.numbers import flag
 from srm_mbs.simulation.rerun import unsupported_reason
 from srm_mbs.simulation.result import SimulationResult, check_run
@@ -115,9 +120,11 @@ def certify(
     """
     check_run(solution)
     settings = checked_settings(solution, rtol)
-    samples = [sampled(part) for part in solution.segments]
-    drift = drift_of(samples)
-    energy = energy_error(at_ends(solution) if len(samples) > 1 else samples[0].run)
+    parts = solution.segments
+    samples = [part.samples() for part in parts]
+    invariants = [invariants_of(*each) for each in zip(parts, samples)]
+    drift = drift_of(parts, invariants)
+    energy = energy_error(solution, samples, invariants)
     reason = unsupported_reason(solution) if flag(again, "again") else "it was not asked for"
     if not reason and not solution.stats.steps:
         reason = "the run took no step"

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srm_mbs.analysis.accuracy.samples import Samples
+from srm_mbs.analysis.accuracy.samples import at_ends
 from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.observables import Invariants
 from srm_mbs.dynamics.scaling import constraint_angles
 from srm_mbs.errors import EvaluationError, InputError
+from srm_mbs.integration.run_samples import RunSamples
 from srm_mbs.model.mechanism import per_model
 from srm_mbs.simulation.result import SimulationResult
 
@@ -87,46 +89,55 @@ def _rows_by_unit(mechanism: Mechanism) -> _RowsByUnit:
     own = {"m": np.flatnonzero(~angles).tolist(), "rad": np.flatnonzero(angles).tolist()}
     sizes = {"m": mechanism.structure.units.length, "rad": 1.0}
     units = [unit for unit in own if own[unit]]
-    starts = [0, len(own[units[0]])][: len(units)]
+    starts = [0, *(len(own[unit]) for unit in units)][: len(units)]
     return _RowsByUnit([(unit, sizes[unit]) for unit in units], own["m"] + own["rad"], starts)
 
 
-def drift_of(samples: Sequence[Samples]) -> tuple[Drift, ...]:
+def invariants_of(part: SimulationResult, samples: RunSamples) -> Invariants:
+    """Closure errors, with a group of rows for each unit, and energies of a segment of a run."""
+    rows = _rows_by_unit(part.mechanism)
+    return part.observables.invariants(*samples, rows.order, rows.starts)
+
+
+def drift_of(
+    parts: Sequence[SimulationResult], invariants: Sequence[Invariants]
+) -> tuple[Drift, ...]:
     """The drift of a run, for each unit of its closure rows and drives; empty for an open chain.
 
     Parameters
     ----------
-    samples
-        Of each of its segments.
+    parts, invariants
+        Its segments, and of each its :func:`invariants_of`.
     """
     found: dict[str, list[list[float]]] = {}
-    for part in samples:
-        run, between = part.run, part.between
-        if not run.mechanism.constrained:
-            continue
-        rows, norms = _rows_by_unit(run.mechanism), run.observables.largest_norms
-        at_ends = [errors[: part.whole] for errors in run.invariants[:2]]
-        within = run.observables.closure_errors(between.t, between.q, between.v)
-        sizes = [norms(errors, rows.order, rows.starts) for errors in (*at_ends, *within)]
-        for (unit, scale), (*largest, position, rate) in zip(rows.units, zip(*sizes)):
-            more = np.maximum(largest, (position, rate))
-            found.setdefault(unit, []).append([*largest, *more, scale])
+    for part, own in zip(parts, invariants):
+        units = _rows_by_unit(part.mechanism).units
+        whole = np.maximum(own.at_ends, own.within).tolist()
+        for k, (unit, scale) in enumerate(units):
+            largest = [each[i] for each in (own.at_ends, whole) for i in (k, k + len(units))]
+            found.setdefault(unit, []).append([*largest, scale])
     worst = {unit: np.maximum.reduce(parts).tolist() for unit, parts in found.items()}
     return tuple(
         Drift(unit, *(*largest, largest[0] / scale)) for unit, (*largest, scale) in worst.items()
     )
 
 
-def energy_error(solution: SimulationResult) -> EnergyError | str:
+def energy_error(
+    solution: SimulationResult, samples: Sequence[RunSamples], invariants: Sequence[Invariants]
+) -> EnergyError | str:
     """Residual of the energy balance, or the reason why it cannot be computed.
 
     Parameters
     ----------
-    solution
-        The run at the ends of its steps (:func:`~srm_mbs.analysis.accuracy.samples.at_ends`).
+    samples, invariants
+        Of each segment of the run, and its :func:`invariants_of`.
     """
     try:
-        balance = solution.energy_balance
+        if len(samples) > 1:
+            balance = at_ends(solution).energy_balance
+        else:
+            ((times, _, ends, _),) = samples
+            balance = solution.balance_at(times[ends], invariants[0].energies)
     except (InputError, EvaluationError) as error:
         return str(error)
     return EnergyError(

@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from srm_mbs._typing import BoolArray, FloatArray
-from srm_mbs.analysis.accuracy.samples import Samples, sample_states, sample_times
+from srm_mbs.analysis.accuracy.samples import sample_times
 from srm_mbs.dynamics.observables import NO_ANGLES
 from srm_mbs.dynamics.scaling import angle_coordinates, start_rounding
 from srm_mbs.errors import InputError
 from srm_mbs.integration.methods.psrm import is_split
+from srm_mbs.integration.run_samples import RunSamples
+from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model
 from srm_mbs.model.numbers import positive_number
 from srm_mbs.simulation.options import tightest_rtol
@@ -53,8 +55,7 @@ SMALLEST_ORDER = 0.5
 """Observed order from which the differences of fixed steps are extrapolated to step 0."""
 
 
-@dataclass(frozen=True)
-class JointDifference:
+class JointDifference(NamedTuple):
     """The largest difference of two runs in one joint.
 
     Attributes
@@ -103,7 +104,7 @@ class Sizes:
     t: FloatArray
     size: FloatArray
 
-    @property
+    @cached_property
     def largest(self) -> float:
         """The largest of ``size``, positions and rates; 0 without any time."""
         return float(self.size.max(initial=0.0))
@@ -241,7 +242,7 @@ def checked_settings(solution: SimulationResult, rtol: float | None) -> list[flo
 def estimate_error(
     solution: SimulationResult,
     settings: list[float],
-    samples: Sequence[Samples],
+    samples: Sequence[RunSamples],
     progress: Any,
 ) -> ErrorEstimate | str:
     """Repeat ``solution`` at each of ``settings``, and compare; or the reason why that failed.
@@ -267,7 +268,7 @@ def estimate_error(
     tightest = runs[-1][1]
     bound = tightest is solution
     partner = runs[-2][1] if bound else tightest
-    known = times, _ = sample_states(solution, samples)
+    known = times, _ = _sample_states(solution, samples)
     # A scheme has its order at the ends of steps only; the coarsest grid is a subset of the others.
     whole_grid = sample_times(runs[0][1], fixed=True) if fixed else times
     least = 0.0 if fixed else READING_ERROR * min(setting for setting, _ in runs[:-1])
@@ -322,7 +323,7 @@ def estimate_error(
         compared.joints
         if beyond == 1.0
         else tuple(
-            replace(row, position=beyond * row.position, rate=beyond * row.rate)
+            row._replace(position=beyond * row.position, rate=beyond * row.rate)
             for row in compared.joints
         ),
         beyond * kept.largest,
@@ -333,6 +334,18 @@ def estimate_error(
         None if apart is None else parted_at(comparison, solution, partner),
         comparison,
     )
+
+
+def _sample_states(
+    solution: SimulationResult, samples: Sequence[RunSamples]
+) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) s, ascending, at which runs are compared, and the states (n, nq + nv) of
+    ``solution``."""
+    if len(samples) > 1:
+        times = sample_times(solution)
+        return times, solution.states(times)
+    ((times, states, _, whole),) = samples
+    return times[:whole], states[:whole]
 
 
 def observed_order(settings: Sequence[float], differences: Sequence[float]) -> float | None:
@@ -467,7 +480,7 @@ def compare(
 
     Windows around jumps of the state, whose times differ, are left out.
     """
-    times = times[: np.searchsorted(times, min(run.span[1], other.span[1]), side="right")]
+    times = times[: times.searchsorted(min(run.span[1], other.span[1]), side="right")]
     jumps = np.zeros(0)
     if len(run.segments) > 1 or len(other.segments) > 1:
         allowed, jumps = _between_jumps(run, other, times)

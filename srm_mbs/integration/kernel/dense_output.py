@@ -22,6 +22,7 @@ from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import CompiledObservables, separated_rows
 from srm_mbs.integration.kernel.system import make_kernel_system, shared, workspace
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.run_samples import RunSamples
 from srm_mbs.integration.singular_passages import ConstraintMonitor, RecordedDips, Turn
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_start
@@ -92,42 +93,56 @@ class CompiledDenseOutput(DenseOutput):
         if self._by_reference:
             return super().__call__(t)
         try:
-            return self._read(t)
+            return self._read("states", _as_array(t))  # type: ignore[no-any-return]
         except ArithmeticError:
             return super().__call__(t)  # raises the error that says why
         except IndexError:
             self.check(t)  # raises
             raise
 
+    def samples(self, unit: FloatArray) -> RunSamples | None:
+        """As :func:`srm_mbs.integration.run_samples.run_samples`; None where that has to read the
+        run, or raises the error that says why it cannot be read."""
+        if self._by_reference:
+            return None
+        try:
+            return RunSamples(*self._read("samples", marshalling.sample_rules(), unit))
+        except ArithmeticError:
+            return None
+
+    def element_works(
+        self, observables: CompiledObservables, t: FloatArray
+    ) -> dict[str, FloatArray] | None:
+        """Work (n,) J of each force element, but that of its potential, up to the ends ``t`` (n,) s
+        of steps, by the weights of the stages; None where the reference integrates it."""
+        if self._by_reference:
+            return None
+        stages = marshalling.weighted_stages(self._scheme.member(False))
+        return observables.element_works(self._compiled, t, *stages)
+
     def between_ends(self, t: FloatArray, allowed: FloatArray) -> FloatArray:
         """As the reference (:meth:`DenseOutput.between_ends`)."""
         if self._by_reference:
             return super().between_ends(t, allowed)
         try:
-            return self._read(t, allowed)
+            return self._read("between_ends", _as_array(t), allowed)  # type: ignore[no-any-return]
         except ArithmeticError:
             return super().between_ends(t, allowed)  # raises the error that says why
         except IndexError:
             self.check(t)  # raises
             raise
 
-    def _read(self, t: FloatArray, *allowed: FloatArray) -> FloatArray:
-        times = np.ascontiguousarray(t, dtype=float)
-        read = self._compiled.between_ends if allowed else self._compiled.states
-        return self._evaluated(lambda kernel_system: read(kernel_system, times, *allowed))  # type: ignore[no-any-return]
-
-    def _evaluated(self, read: Callable[[Any], Any]) -> Any:
-        """``read`` of a kernel system of the mechanism, whose work is counted."""
+    def _read(self, what: str, *arguments: Any) -> Any:
         if self.kernel_system is not None:
-            return self._counted(self.kernel_system, read)
+            return self._read_by(self.kernel_system, what, *arguments)
         code = code_of_record(self._made_by, self._mechanism_system.mechanism)
         with workspace(self._mechanism_system, code) as kernel_system:
-            return self._counted(kernel_system, read)
+            return self._read_by(kernel_system, what, *arguments)
 
-    def _counted(self, kernel_system: Any, read: Callable[[Any], Any]) -> Any:
+    def _read_by(self, kernel_system: Any, what: str, *arguments: Any) -> Any:
         before = kernel_system.evaluations, kernel_system.factorisations
         try:
-            return read(kernel_system)
+            return getattr(self._compiled, what)(kernel_system, *arguments)
         finally:
             self._mechanism_system.count(
                 kernel_system.evaluations - before[0], kernel_system.factorisations - before[1]
@@ -143,7 +158,7 @@ class CompiledDenseOutput(DenseOutput):
         try:
             with self.observables.all_rows() as all_rows:
                 given = all_rows, *search, _dip_search(scheme), dips.samples, dips.tops
-                others, turns = self._evaluated(lambda own: self._compiled.turns(own, *given))
+                others, turns = self._read("turns", *given)
         except ArithmeticError:
             return None
         return dips.at_no_turn(others, [Turn(*turn) for turn in turns])
@@ -173,6 +188,10 @@ class CompiledDenseOutput(DenseOutput):
             return core.DenseOutput(schemes, constants, *self.recorded)  # type: ignore[union-attr]
         steps = marshalling.steps_struct(self._steps)
         return core.DenseOutput(system.nq, system.nv, schemes, constants, steps)  # type: ignore[union-attr]
+
+
+def _as_array(t: FloatArray) -> FloatArray:
+    return np.ascontiguousarray(t, dtype=float)
 
 
 @lru_cache(maxsize=64)
@@ -260,5 +279,8 @@ def dips_in_records(
 
 def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> BoolArray:
     """As :func:`srm_mbs.integration.dense_output.close_to_singular`, of sigmas (n, s + 1)."""
-    constants = marshalling.dense_constants()
-    return np.array(core.close_to_singular(abscissae.tolist(), sigmas, constants))  # type: ignore
+    found = core.close_to_singular(  # type: ignore[union-attr]
+        abscissae.tolist(), sigmas, marshalling.dense_constants()
+    )
+    close: BoolArray = found > 0.0
+    return close

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -25,26 +25,28 @@ from srm_mbs.integration.messages import RunFailure, StopReason
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
 
-class StepSummary(NamedTuple):
-    """Facts about the steps of a run that most users need.
+class StepSummary(Protocol):
+    """Facts about the steps of a run that most users need, each found where it is read."""
 
-    Attributes
-    ----------
-    steps, zone_steps
-        Number of accepted steps, and of those with a zone.
-    least_sigma
-        The least sigma of their stages.
-    held
-        Whether a stage kept the normals of the last node.
-    stiff
-        Whether the problem was found to be stiff.
-    """
+    @property
+    def steps(self) -> int:
+        """Number of accepted steps."""
 
-    steps: int
-    zone_steps: int
-    least_sigma: float
-    held: bool
-    stiff: bool
+    @property
+    def zone_steps(self) -> int:
+        """Number of those with a zone."""
+
+    @property
+    def least_sigma(self) -> float:
+        """The least sigma of their stages."""
+
+    @property
+    def held(self) -> bool:
+        """Whether a stage kept the normals of the last node."""
+
+    @property
+    def stiff(self) -> bool:
+        """Whether the problem was found to be stiff."""
 
 
 @dataclass
@@ -104,9 +106,14 @@ class CompiledRecord(RunRecord):
             return None
         return np.array([times[0], self.stop]), np.array([states[0], self.stop_state])
 
+    def span(self) -> tuple[float, float]:
+        """Start and end (s) of the steps that no sink took, after :meth:`close`."""
+        start, end = self._records.span
+        return start, end if self.stop is None else self.stop
+
     def summary(self) -> StepSummary | None:
         """The summary of the steps that no sink took, after :meth:`close`; None before."""
-        return None if self._records is None else StepSummary(*self._records.summary)
+        return self._records  # type: ignore[no-any-return]
 
     def data(self, scheme: ButcherTableau, tangent_size: int) -> StepData:
         """The accepted steps as arrays; after :meth:`close` the same at every call."""

@@ -26,6 +26,7 @@ from srm_mbs.integration import (
     driver,
     events,
     reversals,
+    run_samples,
     singular_endpoints,
 )
 from srm_mbs.integration.breakpoints import SmoothIntervals
@@ -388,10 +389,30 @@ def dense_constants() -> Any:
     )
 
 
+@lru_cache(maxsize=1)
+def sample_rules() -> Any:
+    """``SampleRules`` of run_samples.hpp."""
+    fewest, one_of = zip(*run_samples.READ_STEPS)
+    return _core.SampleRules(
+        most_ends=run_samples.MAX_SAMPLED_ENDS,
+        even_times=run_samples.EVEN_TIMES,
+        fewest=fewest,
+        one_of=one_of,
+        read_at=run_samples.READ_AT,
+    )
+
+
 @lru_cache(maxsize=64)
 def scheme_dense(scheme: ButcherTableau) -> Any:
     """``SchemeDense`` of dense.hpp."""
     return _core.SchemeDense(abscissae=scheme.abscissae, extension=extension_struct(scheme.dense))
+
+
+@lru_cache(maxsize=64)
+def weighted_stages(scheme: ButcherTableau) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rows of A, weights and abscissae of the stages of ``scheme`` that have weights."""
+    stages = np.flatnonzero(scheme.b)
+    return scheme.A[stages], scheme.b[stages], scheme.c[stages]
 
 
 @lru_cache(maxsize=64)
@@ -416,7 +437,16 @@ def event_constants() -> Any:
     )
 
 
-_STEP_ARRAYS = ("times", "states", "rates", "corrections", "sigmas", "end_rate", "stiff")
+_STEP_ARRAYS = (
+    "times",
+    "states",
+    "rates",
+    "corrections",
+    "sigmas",
+    "error_ratios",
+    "end_rate",
+    "stiff",
+)
 
 
 def steps_struct(steps: StepData) -> Any:

@@ -161,13 +161,22 @@ class CompiledObservables(Observables):
         except ArithmeticError:
             return super().closure_errors(t, q, v)
 
-    def invariants(self, t: FloatArray, q: FloatArray, v: FloatArray) -> Invariants:
+    def invariants(
+        self,
+        t: FloatArray,
+        states: FloatArray,
+        ends: list[int],
+        whole: int,
+        order: list[int],
+        starts: list[int],
+    ) -> Invariants:
         """As the reference, with one pass over the bodies."""
+        numbers = t, states, ends, whole, order, starts
         try:
             with self.all_rows() as kernel_system:
-                return Invariants(*kernel_system.closure_errors(*_states(t, q, v), True))
+                return Invariants(*kernel_system.invariants(*numbers))
         except ArithmeticError:
-            return super().invariants(t, q, v)
+            return super().invariants(*numbers)
 
     def jacobians(self, t: FloatArray, q: FloatArray) -> FloatArray:
         times, places = np.ascontiguousarray(t, dtype=float), np.ascontiguousarray(q)
@@ -324,6 +333,22 @@ class CompiledObservables(Observables):
         except ArithmeticError:  # the reference raises the error that says why
             return super().stage_powers(chosen, times, states, rates, A, c)
         return dict(zip(working_elements(self.mechanism), np.moveaxis(found, 2, 0)))
+
+    def element_works(
+        self, dense: Any, t: FloatArray, A: FloatArray, b: FloatArray, c: FloatArray
+    ) -> dict[str, FloatArray] | None:
+        """Work (n,) J of each element of :meth:`stage_powers` up to the ends ``t`` (n,) s of steps
+        of ``dense``, the dense output of the kernel, by the weights b (k,) of their stages; None
+        where that is not all, and where powers cannot be evaluated."""
+        structs = _structs_of_dampers(self.mechanism)
+        if structs is None:
+            return None
+        try:
+            with self.all_rows() as kernel_system:
+                found = dense.works(kernel_system, t, structs, A, b, c)
+        except ArithmeticError:
+            return None
+        return None if found is None else dict(zip(working_elements(self.mechanism), found.T))
 
 
 @per_model

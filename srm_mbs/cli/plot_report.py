@@ -132,7 +132,10 @@ def plot(
         "size": size.split(",") if size and "," in size else size,
         "dpi": dpi,
     }
-    options = {name: value for name, value in wanted.items() if value}
+    # A number or a text that was given counts, zero and empty too.
+    options: dict[str, Any] = {
+        name: value for name, value in wanted.items() if value or isinstance(value, float | str)
+    }
     check_options(kind, options)
     solution = srm_mbs.load_solution(run)
     name = run.stem if kind == "run" else f"{run.stem}_{kind}"

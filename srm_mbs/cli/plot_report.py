@@ -125,11 +125,11 @@ def plot(
         "accelerations": accelerations,
         "x": x,
         "unit": unit,
-        "at": None if at is None else at.split(","),
+        "at": _numbers(at),
         "crank": crank,
-        "view": view.split(",") if view and "," in view else view,
+        "view": _numbers(view),
         "title": title,
-        "size": size.split(",") if size and "," in size else size,
+        "size": _numbers(size),
         "dpi": dpi,
     }
     # A number or a text that was given counts, zero and empty too.
@@ -143,6 +143,14 @@ def plot(
     check_output(path, "--out", FORMATS)
     solution.plot(path, kind, **options)
     say_written(path)
+
+
+def _numbers(text: str | None) -> list[float] | str | None:
+    """The numbers between commas in ``text``, or itself where it is something else."""
+    try:
+        return None if text is None else [float(number) for number in text.split(",")]
+    except ValueError:
+        return text
 
 
 @reported

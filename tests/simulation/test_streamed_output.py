@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.integration.kernel import driver
 from srm_mbs.simulation import streamed_output
 from tests.support.backends import on_both
 from tests.support.bundled import load
@@ -146,3 +147,24 @@ def test_ten_thousand_turns_with_two_output_times_take_little_memory() -> None:
     assert steps > 100_000
     # The steps alone would take 600 bytes each.
     assert megabytes < 100.0
+
+
+def test_a_run_whose_steps_would_fill_the_memory_ends_and_says_to_give_output_times(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mechanism = load("squeezing_mechanism")  # whose motor has no limit: ever more steps a second
+    whole = srm.simulate(mechanism, 2.0)
+    monkeypatch.setattr(driver, "MOST_STEP_BYTES", 2e7)
+    with pytest.warns(srm.FailedRunWarning):
+        ended = srm.simulate(mechanism, 2.0)
+    assert not ended.success
+    assert "of the memory of this machine. Everything up to there is kept. Give t_eval" in (
+        ended.message
+    )
+    count = len(ended.t)
+    assert 1000 < count < len(whole.t)
+    np.testing.assert_array_equal(ended.t, whole.t[:count])
+    np.testing.assert_array_equal(ended.q, whole.q[:count])
+    sampled = srm.simulate(mechanism, 2.0, t_eval=[1.0, 2.0])
+    assert sampled.success
+    np.testing.assert_array_equal(sampled.q, whole([1.0, 2.0])[0])

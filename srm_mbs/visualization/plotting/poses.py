@@ -192,7 +192,7 @@ def plane_normal(mechanism: Mechanism) -> tuple[float, ...] | None:
 def _direction(view: Any) -> tuple[float, ...]:
     if isinstance(view, str) and view in LOOKS:
         return LOOKS[view]
-    numbers = None if isinstance(view, str) else finite_array(view, (3,))
+    numbers = finite_array(view, (3,))
     if numbers is None or not np.linalg.norm(numbers) > 0.0:
         raise InputError(
             f"{safe_repr(view)} is not a direction of view",

@@ -180,8 +180,11 @@ class InputError(SrmError, ValueError):
 
 def missing_folder(path: str | os.PathLike[str]) -> tuple[str, str] | None:
     """The problem and its remedy where the folder of a file ``path`` to write does not exist."""
-    folder = os.path.dirname(os.path.realpath(path))
-    return None if os.path.exists(folder) else (f"there is no folder {folder!r}", "Make it first")
+    given, folder = os.path.dirname(path), os.path.dirname(os.path.realpath(path))
+    if os.path.exists(folder):
+        return None
+    named = folder if os.path.exists(given) else given  # a link may lead there
+    return f"there is no folder {os.fspath(named)!r}", "Make it first"
 
 
 def unwritable(path: str | os.PathLike[str], error: OSError) -> InputError:

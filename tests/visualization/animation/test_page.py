@@ -870,6 +870,20 @@ def test_bodies_and_paths_of_a_mechanism_that_travels_far_stay_before_the_camera
             assert min(np.linalg.norm(np.array(ball) - middle) for middle in middles) < 1.0 + 1e-3
 
 
+def test_a_value_that_hardly_varies_has_the_digits_that_its_curve_needs() -> None:
+    mechanism = load("four_bar")
+    start = srm.assemble(mechanism, v={"crank": 0.1})
+    solution = srm.simulate(mechanism, 0.01, q0=start.q, v0=start.v)
+    times = np.linspace(0.0, 0.01, 50)
+    angles = {name: solution.at(times).joint(name)[0] for name in mechanism.joint_names}
+    shown = {
+        value["label"]: value["samples"] for value in values_over_time(solution, times)["values"]
+    }
+    for name, angle in angles.items():
+        assert np.ptp(angle) < 2e-3  # four digits would make it a staircase
+        np.testing.assert_allclose(shown[name], angle, rtol=0.0, atol=1e-3 * np.ptp(angle))
+
+
 def test_marks_of_many_loops_or_many_passages_have_their_times_only() -> None:
     for name, t_end, named in [("n_four_bar_2", 2.0, True), ("n_four_bar_13", 2.0, False)]:
         solution = srm.simulate(load(name), t_end)

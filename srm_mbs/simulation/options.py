@@ -20,7 +20,7 @@ from srm_mbs.integration.control.prescribed_times import PLACEMENTS
 from srm_mbs.integration.methods.base import NEGLIGIBLE, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM, is_split
-from srm_mbs.integration.methods.tableaus import get_tableau
+from srm_mbs.integration.methods.tableaus import TABLEAUS, get_tableau
 from srm_mbs.integration.methods.thesis.srm import SRM
 from srm_mbs.model.numbers import choice, finite_array, finite_number, flag, positive_number
 
@@ -280,6 +280,12 @@ def _named(name: str, tableau: str | ButcherTableau | None) -> Method:
 def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -> Method:
     """A method object from a name or an object."""
     if isinstance(method, str):
+        if method.lower() in TABLEAUS:  # as of SciPy's solve_ivp: method="DOP853"
+            raise InputError(
+                f"{safe_repr(method)} is a tableau, not a method",
+                element="method",
+                remedy=f'Give tableau="{method.lower()}"',
+            )
         name = choice(method, METHODS, "method")
         if tableau is not None:
             get_tableau(tableau)  # refuses what cannot be looked up

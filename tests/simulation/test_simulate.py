@@ -267,6 +267,15 @@ def test_names_of_options_have_one_spelling(four_bar: srm.Mechanism, option: str
     assert wrong.value.element == option
 
 
+@pytest.mark.parametrize("name", ["DOP853", "dopr54"])
+def test_a_tableau_in_place_of_a_method_is_told_where_it_belongs(
+    four_bar: srm.Mechanism, name: str
+) -> None:
+    remedy = f'is a tableau, not a method. Give tableau="{name.lower()}"'
+    with pytest.raises(srm.InputError, match=remedy):
+        srm.simulate(four_bar, 0.1, method=name)
+
+
 def test_an_assembly_as_initial_state_is_told_which_part_of_it_to_give(
     four_bar: srm.Mechanism,
 ) -> None:

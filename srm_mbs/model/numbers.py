@@ -227,8 +227,8 @@ def positive_number(
     InputError
         With that ``remedy``, if it is anything else.
     """
-    number = _number(value)
-    if number is None or number <= 0.0:
+    number = value if type(value) is float else _number(value)
+    if number is None or not 0.0 < number < math.inf:
         raise InputError(
             f"{name} = {safe_repr(value)} is not a positive number{unit}",
             element=name,

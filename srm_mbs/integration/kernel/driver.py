@@ -26,18 +26,6 @@ from srm_mbs.integration.messages import RunFailure, StopReason
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
 
-def _physical_memory() -> float:
-    """Memory of this machine (bytes); infinite where the system does not say."""
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):  # Windows has no sysconf
-        return np.inf
-
-
-MOST_STEP_BYTES = 0.5 * _physical_memory()
-"""Size of the steps at which a run ends, before the system ends the program."""
-
-
 class StepSummary(NamedTuple):
     """Facts about the steps of a run that most users need.
 
@@ -226,6 +214,18 @@ def integrate(
     system.count(run.kernel_system.evaluations, run.kernel_system.factorisations)
     record.wall_time = time.perf_counter() - started
     return record
+
+
+def _physical_memory() -> float:
+    """Memory of this machine (bytes); infinite where the system does not say."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):  # Windows has no sysconf
+        return np.inf
+
+
+MOST_STEP_BYTES = 0.5 * _physical_memory()
+"""Size of the steps at which a run ends, before the system ends the program."""
 
 
 def _out_of_memory(count: int, size: int) -> RunFailure:

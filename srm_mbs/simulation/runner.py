@@ -277,7 +277,8 @@ def _make_record(
 
 def lead_with_cause(problem: Problem, record: RunRecord) -> None:
     """Let the message of a run whose steps failed begin with the cause, if it is found."""
-    if record.status is not RunStatus.FAILED or record.error is not None:
+    failed = record.status is RunStatus.FAILED and record.stop_reason is not StopReason.MEMORY
+    if not failed or record.error is not None:
         return
     state = record.run.core.state if isinstance(record, CompiledRecord) else record.last_state
     q, v = problem.system.split(state)
@@ -1102,7 +1103,8 @@ def _half_turns(names: tuple[str, ...]) -> str:
 
 def _driven_too_far(mechanism: Mechanism, record: RunRecord) -> str:
     """A sentence on drives as a possible cause of a failure; empty without them."""
-    if record.status is not RunStatus.FAILED or not mechanism.drives or record.cause is not None:
+    failed = record.status is RunStatus.FAILED and record.stop_reason is not StopReason.MEMORY
+    if not failed or not mechanism.drives or record.cause is not None:
         return ""
     names = ", ".join(drive.name for drive in mechanism.drives)
     return f" A drive ({names}) may lead where the mechanism cannot follow."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -165,6 +166,12 @@ def test_a_run_whose_steps_would_fill_the_memory_ends_and_says_to_give_output_ti
     assert 1000 < count < len(whole.t)
     np.testing.assert_array_equal(ended.t, whole.t[:count])
     np.testing.assert_array_equal(ended.q, whole.q[:count])
+    motor = srm.Drive(srm.ConstantSpeed(6.0), joint="crank")
+    driven = replace(load("slider_crank_regular"), drives=(motor,))
+    driven = driven.with_state(srm.assemble(driven).q, srm.assemble(driven).v)
+    with pytest.warns(srm.FailedRunWarning):
+        turning = srm.simulate(driven, 1e6, max_step=1e-3)
+    assert turning.message.endswith("the run then keeps no other state.")
     sampled = srm.simulate(mechanism, 2.0, t_eval=[1.0, 2.0])
     assert sampled.success
     np.testing.assert_array_equal(sampled.q, whole([1.0, 2.0])[0])

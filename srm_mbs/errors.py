@@ -178,10 +178,20 @@ class InputError(SrmError, ValueError):
         return self
 
 
+def missing_folder(path: str | os.PathLike[str]) -> tuple[str, str] | None:
+    """The problem and its remedy where the folder of a file ``path`` to write does not exist."""
+    given, folder = os.path.dirname(path), os.path.dirname(os.path.realpath(path))
+    if os.path.exists(folder):
+        return None
+    named = folder if os.path.exists(given) else given  # a link may lead there
+    return f"there is no folder {os.fspath(named)!r}", "Make it first"
+
+
 def unwritable(path: str | os.PathLike[str], error: OSError) -> InputError:
     """The error about a file or folder ``path`` that the system does not let be written."""
-    reason = error.strerror or error
-    return InputError(f"it cannot be written: {reason}", file=os.fspath(path), remedy=CHECK_WRITING)
+    otherwise = (f"it cannot be written: {error.strerror or error}", CHECK_WRITING)
+    problem, remedy = missing_folder(path) or otherwise
+    return InputError(problem, file=os.fspath(path), remedy=remedy)
 
 
 class naming:  # noqa: N801 - used as a function

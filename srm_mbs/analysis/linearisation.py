@@ -10,7 +10,7 @@ linear in the forces.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from numbers import Integral
 from typing import Any
 
@@ -76,7 +76,27 @@ class Linearisation:
     inputs: tuple[str, ...]
     drift: FloatArray
     to_joints: FloatArray
-    chart: TangentChart = field(repr=False)
+    chart: TangentChart
+
+    def __repr__(self) -> str:
+        k, ni = len(self.coordinates), len(self.inputs)
+        return (
+            f"Linearisation({self.mechanism.name!r}, {counted(k, 'coordinate')}, "
+            f"{counted(ni, 'input')}, {'stable' if self.stable else 'not stable'})"
+        )
+
+    def __str__(self) -> str:
+        shown = {
+            "coordinates z": ", ".join(self.coordinates),
+            "inputs tau": ", ".join(self.inputs),
+            "q": self.q,
+            "v": self.v,
+            "A": self.A,
+            "B": self.B,
+            "drift": self.drift,
+            "eigenvalues (1/s)": self.eigenvalues,
+        }
+        return "\n".join([repr(self), *(f"{name}:\n{value}" for name, value in shown.items())])
 
     @cached_property
     def _eigen(self) -> tuple[FloatArray | ComplexArray, FloatArray | ComplexArray]:

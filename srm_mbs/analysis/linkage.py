@@ -29,8 +29,9 @@ from srm_mbs.analysis.path_following import follow
 from srm_mbs.assembly.position import ClosureProblem, polish
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.dynamics.constraints.wrenches import Placements
+from srm_mbs.dynamics.manifold import joint_track
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
-from srm_mbs.dynamics.scaling import coordinate_units, is_angle, joint_track
+from srm_mbs.dynamics.scaling import coordinate_units, is_angle
 from srm_mbs.errors import InputError, KnownKeys
 from srm_mbs.formats.files import checked_path
 from srm_mbs.model.anchors import one_degree_joint

@@ -125,14 +125,17 @@ def plot(
         "accelerations": accelerations,
         "x": x,
         "unit": unit,
-        "at": None if at is None else at.split(","),
+        "at": _numbers(at),
         "crank": crank,
-        "view": view.split(",") if view and "," in view else view,
+        "view": _numbers(view),
         "title": title,
-        "size": size.split(",") if size and "," in size else size,
+        "size": _numbers(size),
         "dpi": dpi,
     }
-    options = {name: value for name, value in wanted.items() if value}
+    # A number or a text that was given counts, zero and empty too.
+    options: dict[str, Any] = {
+        name: value for name, value in wanted.items() if value or isinstance(value, float | str)
+    }
     check_options(kind, options)
     solution = srm_mbs.load_solution(run)
     name = run.stem if kind == "run" else f"{run.stem}_{kind}"
@@ -140,6 +143,14 @@ def plot(
     check_output(path, "--out", FORMATS)
     solution.plot(path, kind, **options)
     say_written(path)
+
+
+def _numbers(text: str | None) -> list[float] | str | None:
+    """The numbers between commas in ``text``, or itself where it is something else."""
+    try:
+        return None if text is None else [float(number) for number in text.split(",")]
+    except ValueError:
+        return text
 
 
 @reported

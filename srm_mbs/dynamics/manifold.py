@@ -19,8 +19,9 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.scaling import vector_coordinates
+from srm_mbs.dynamics.scaling import is_angle, vector_coordinates
 from srm_mbs.errors import EvaluationError, InputError
+from srm_mbs.model.coordinates import position_of
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_tree
 
@@ -73,6 +74,13 @@ class GroupJoint:
         """Size of the joint's angular part of a whole tangent vector v (nv,): rad or rad/s."""
         angular = {"so3": 0, "se3": 3, "se2": 2}[self.group]
         return float(np.linalg.norm(v[self.start + angular : self.start + self.size]))
+
+
+def joint_track(mechanism: MechanismData, q: FloatArray, name: str) -> FloatArray:
+    """Positions (n,) of the one-degree joint ``name`` along q (n, nq): rad, without jumps of a
+    turn, or m."""
+    found = np.array([position_of(mechanism, row, name) for row in q])
+    return np.unwrap(found) if is_angle(mechanism.model, name) else found
 
 
 def group_joints(model: pin.Model) -> tuple[GroupJoint, ...]:

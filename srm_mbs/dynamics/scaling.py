@@ -24,7 +24,6 @@ from srm_mbs.dynamics.constraints.rows import world_jacobian
 from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.errors import EvaluationError
 from srm_mbs.model.closures import LoopClosure
-from srm_mbs.model.coordinates import position_of
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model, per_start, per_tree
 from srm_mbs.model.model_data import TreeNumbers, tree_numbers
@@ -88,13 +87,6 @@ def _angles(model: pin.Model, closures: Sequence[LoopClosure]) -> BoolArray:
         out += [False] * lengths.stop + [True] * (alignments.stop - alignments.start)
         out += [is_angle(model, row.joints[0]) for row in closure.rows.joint_rows]
     return np.array(out, dtype=bool)
-
-
-def joint_track(mechanism: MechanismData, q: FloatArray, name: str) -> FloatArray:
-    """Positions (n,) of the one-degree joint ``name`` along q (n, nq): rad, without jumps of a
-    turn, or m."""
-    found = np.array([position_of(mechanism, row, name) for row in q])
-    return np.unwrap(found) if is_angle(mechanism.model, name) else found
 
 
 def is_angle(model: pin.Model, name: str) -> bool:

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import IO
 
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, missing_folder
 
 fcntl: ModuleType | None
 try:
@@ -253,11 +253,13 @@ def _finish(temporary: Path, target: Path) -> None:
 
 
 def _about(error: OSError, path: str | os.PathLike[str], temporary: Path | None) -> OSError:
-    """``error``, naming ``path`` in place of the temporary file."""
+    """``error``, naming ``path`` in place of the temporary file, and a folder that is missing."""
     made = temporary is not None
     if error.errno is None or (made and error.filename not in (None, str(temporary), temporary)):
         return error
-    return OSError(error.errno, error.strerror or os.strerror(error.errno), os.fspath(path))
+    missing = missing_folder(path)
+    reason = error.strerror or os.strerror(error.errno)
+    return OSError(error.errno, ". ".join(missing) if missing else reason, os.fspath(path))
 
 
 @contextmanager

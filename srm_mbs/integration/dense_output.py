@@ -252,6 +252,11 @@ class HermiteStep:
         return np.array([self._system.retract(self._start, delta) for delta in deltas])
 
 
+def step_bytes(scheme: ButcherTableau, tangent_size: int) -> int:
+    """Memory that a step takes, about: rates, and as much for states, corrections and sigmas."""
+    return 8 * ((scheme.n_stages + 3) * tangent_size + 2 * scheme.n_stages)
+
+
 @dataclass(frozen=True, eq=False)
 class StepData:
     """The accepted steps of a run as arrays, n steps of a tableau with s stages.

@@ -33,6 +33,8 @@ SMALLEST_STEP = 1e-14
 """Shortest step, over the length of the run."""
 WATCHED_STEPS = 5000
 """Steps over which the progress of a run is measured."""
+MANY_STEPS = 1e5
+"""Remaining steps of an interrupted run from which its message says what may shorten them."""
 STANDSTILL = 1e-6
 """Part of the run that WATCHED_STEPS steps must cover: a slower one would need 5e9 steps."""
 LARGE_CORRECTION = 1e-3
@@ -183,6 +185,16 @@ class RunRecord:
             self.error = error
             self.message = f"Stopped at t = {t:.6g} s: {error}. Everything up to there is kept."
 
+    def add_pace(self, t_end: float, remedy: str) -> None:
+        """Say in the message of an interrupted run to ``t_end`` (s) how many steps remain, with the
+        sentence ``remedy`` if they are many."""
+        end = self.end_of_steps()
+        h = end.last_time - end.last_start
+        if h > 0.0:
+            left = (t_end - end.last_time) / h
+            self.message += f" The last step was {h:.1e} s long; {left:.1e} such steps remain."
+            self.message += f" {remedy}" if left > MANY_STEPS else ""
+
     def mark_failed(
         self,
         failure: RunFailure,
@@ -219,7 +231,7 @@ class RunRecord:
             return self.message
         failure, t, h, sigma, adaptive, words = self._failure
         near = f" {words.singular} (sigma = {sigma:.1e})." if sigma < NAMED_SIGMA else ""
-        remedy = (
+        remedy = failure.remedy or (
             f"Try a smaller {'rtol' if adaptive else 'step'}, another tableau, or check that "
             f"{words.check}"
         )

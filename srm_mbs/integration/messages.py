@@ -28,15 +28,18 @@ class StopReason(Enum):
         "closures that seemed to follow from the others open: no motion was found that keeps all "
         "loops closed and follows all drives, the mechanism is locked there"
     )
+    MEMORY = "the steps take too much memory"
     UNSTABLE_SWEEPS = "the sweeps do not damp their constraint errors"
 
 
 @dataclass(frozen=True)
 class RunFailure:
-    """Why a run could not continue: the reason, and a sentence for the message of the run."""
+    """Why a run could not continue: the reason, a sentence for the message of the run, and what to
+    do if that is known (a clause that begins with a verb)."""
 
     reason: StopReason
     sentence: str
+    remedy: str | None = None
 
     @classmethod
     def of(cls, reason: StopReason) -> RunFailure:

@@ -124,7 +124,7 @@ def _fault(law: Law, problem: str, remedy: str) -> InputError:
 def _take(law: Law, key: str, above: float = -math.inf) -> float:
     """Check a number of ``law`` and store it as a float."""
     given = getattr(law, key)
-    number = None if isinstance(given, (bool, str)) else finite_array(given, ())
+    number = finite_array(given, ())
     if number is None:
         raise _fault(
             law, f"{key} = {safe_repr(given)} is not a finite number", f"Give a number for {key}"

@@ -23,8 +23,8 @@ FEW = 32
 def finite_array(
     values: Any, shape: tuple[int | None, ...] | None = None, *, new: bool = True
 ) -> FloatArray | None:
-    """``values`` as an array; None unless it is real, finite, without masked elements, and of that
-    shape.
+    """``values`` as an array; None unless they are numbers, real, finite, without masked elements,
+    and of that shape.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def finite_array(
     try:
         if np.ma.is_masked(values):
             return None  # NumPy drops masks
-        array = real_array(values, new=new)
+        array = real_array(values, new=new, booleans=False)
     except Exception:  # objects may raise anything
         return None
     fits = shape in (None, array.shape) or (
@@ -52,22 +52,35 @@ def finite_array(
     return array if _all_finite(array) else None
 
 
-def real_array(values: Any, *, new: bool = True) -> FloatArray:
-    """``values`` as an array of floats of any shape; ``new`` as of :func:`finite_array`.
+def real_array(values: Any, *, new: bool = True, booleans: bool = True) -> FloatArray:
+    """``values`` as an array of floats of any shape; ``new`` as of :func:`finite_array`, and
+    ``booleans``: whether truth values count as 0 and 1, as those that functions return do.
 
     Raises
     ------
     TypeError
-        If they are complex: NumPy drops imaginary parts with no more than a warning.
+        If they are texts, dates or complex, all of which NumPy converts, the last with no more than
+        a warning.
     Exception
         Whatever their conversion raises.
     """
     given = np.array(values, order="C") if new else np.asarray(values)
     if given.dtype == float:
         return given
-    if given.dtype.kind == "c":
-        raise TypeError("complex values")
+    of_objects = given.dtype.kind == "O"
+    known = _NUMBER_KINDS if booleans else _NUMBER_KINDS.replace("b", "")
+    if given.dtype.kind not in known or (of_objects and any(map(_is_text, given.flat))):
+        kind = "complex values" if given.dtype.kind == "c" else "values that are no numbers"
+        raise TypeError(kind)
     return given.astype(float)
+
+
+_NUMBER_KINDS = "biufO"
+"""Kinds of NumPy's data types whose elements may be real numbers; objects such as fractions too."""
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str | bytes | bytearray)
 
 
 def _all_finite(array: FloatArray) -> bool:
@@ -193,16 +206,14 @@ def finite_number(
     InputError
         About ``element``, with the ``remedy``, if it is anything else.
     """
-    if _is_finite_float(value):
-        return float(value)
-    array = finite_array(value, ())
-    if array is None:
+    number = _number(value)
+    if number is None:
         raise InputError(
             f"{name} = {safe_repr(value)} is not a finite number",
             element=element,
             remedy=remedy,
         )
-    return float(array)
+    return number
 
 
 def positive_number(
@@ -216,11 +227,8 @@ def positive_number(
     InputError
         With that ``remedy``, if it is anything else.
     """
-    try:
-        number = float(value)
-    except Exception:  # objects may raise anything
-        number = math.nan
-    if not (math.isfinite(number) and number > 0.0):
+    number = value if type(value) is float else _number(value)
+    if number is None or not 0.0 < number < math.inf:
         raise InputError(
             f"{name} = {safe_repr(value)} is not a positive number{unit}",
             element=name,
@@ -238,7 +246,8 @@ def positive_integer(value: Any, name: str, remedy: str, unit: str = "") -> int:
     InputError
         With that ``remedy``, if it is anything else, True included.
     """
-    if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+    whole = isinstance(value, Integral) and not isinstance(value, bool | np.timedelta64)
+    if not whole or value < 1:
         raise InputError(
             f"{name} = {safe_repr(value)} is not a positive whole number{unit}",
             element=name,
@@ -249,6 +258,14 @@ def positive_integer(value: Any, name: str, remedy: str, unit: str = "") -> int:
 
 def _is_finite_float(value: Any) -> bool:
     return type(value) is float and math.isfinite(value)
+
+
+def _number(value: Any) -> float | None:
+    """``value`` as a float; None unless it is one finite number."""
+    if type(value) in (float, np.float64):  # as :func:`finite_array`, in a tenth of its time
+        return float(value) if math.isfinite(value) else None
+    array = finite_array(value, ())
+    return None if array is None else float(array)
 
 
 def finite_numbers(

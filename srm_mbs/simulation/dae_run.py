@@ -43,6 +43,8 @@ Result = TypeVar("Result", bound=DaeResult)
 
 CONSISTENT = 1e-8
 """Largest constraint error of an accepted start, as a relative error of x0."""
+PACE_REMEDY = "A larger rtol, or a right-hand side that changes less abruptly, allows longer ones."
+"""What may shorten a run that was interrupted."""
 TURN_REMEDY = (
     'Try a smaller rtol or step, restarted sweeps with T = "inverse" (restart=True, carry=True), '
     "or PSRM in its split form."
@@ -149,6 +151,8 @@ def run_dae(
         watch = EventWatch(method.scheme, prepared, state.size)
     record, wrappers, first_sweeps = _integrate(system, options, norm, state, watch)
     raise_at_first_call(record.error, t0)
+    if record.status is RunStatus.INTERRUPTED:
+        record.add_pace(options.t_end, PACE_REMEDY)
     turned = suspected(wrappers)
     if first_sweeps:
         _add_sweep_failure(system, options, record, first_sweeps, turned)

@@ -1,10 +1,13 @@
-"""Causes of failures that a reader can act on: unstable sampled controllers, drives at their dead
-points, and starts at positions so large that their rounding exceeds what closures are held to.
+"""Causes of failures that a reader can act on: controllers that are unstable or no functions of the
+state, drives at their dead points, and starts at positions so large that their rounding exceeds
+what closures are held to.
 
 A run fails where its steps fail, and says so; these causes come first in its message.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -104,6 +107,30 @@ class HeldForceWatch:
         cause = self.cause(interval)
         if cause is not None:
             raise ControllerError(f"{cause.clause}. {cause.remedy}", t)
+
+
+def unrepeatable(
+    mechanism: Mechanism,
+    force: Callable[[float, FloatArray, FloatArray], FloatArray],
+    t: float,
+    q: FloatArray,
+    v: FloatArray,
+) -> FailureCause | None:
+    """The controller with the ``force`` (nv,) that returns another one when it is called again with
+    the same t (s), q (nq,) and v (nv,); None if it does not."""
+    try:
+        first, second = force(t, q, v), force(t, q, v)
+    except ControllerError:
+        return None
+    worst = int(np.argmax(np.abs(first - second)))
+    if first[worst] == second[worst]:
+        return None
+    return FailureCause(
+        "the controller is not a function of t, q and v: called twice there, it returned "
+        f"{first[worst]:.3g} and {second[worst]:.3g} for the joint "
+        f"{safe_repr(_joint_of(mechanism, worst))}",
+        "Give sample_time, with which its force is held between samples",
+    )
 
 
 def _joint_of(mechanism: Mechanism, coordinate: int) -> str:

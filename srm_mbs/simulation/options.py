@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import InputError, joined_names, known_names, safe_repr, warn
+from srm_mbs.errors import InputError, joined_names, safe_repr, warn
 from srm_mbs.integration.control.prescribed_times import PLACEMENTS
 from srm_mbs.integration.methods.base import NEGLIGIBLE, Method
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import PSRM, is_split
-from srm_mbs.integration.methods.tableaus import get_tableau
+from srm_mbs.integration.methods.tableaus import TABLEAUS, get_tableau
 from srm_mbs.integration.methods.thesis.srm import SRM
 from srm_mbs.model.numbers import choice, finite_array, finite_number, flag, positive_number
 
@@ -125,15 +125,23 @@ class RunOptions(NamedTuple):
         flag(self.raise_on_failure, "raise_on_failure")
         tightest, loosest = rtol_range
         t0, t_end = span
-        for name in ("step", "first_step", "max_step"):
-            if getattr(self, name) is not None:
-                positive_number(getattr(self, name), name, unit)
+        step, first_step, max_step = (
+            None if value is None else positive_number(value, name, unit)
+            for name, value in (
+                ("step", self.step),
+                ("first_step", self.first_step),
+                ("max_step", self.max_step),
+            )
+        )
         check_progress(self.progress, arguments)
         return self._replace(
             t0=t0,
             t_end=t_end,
             placement=checked_placement(self.placement),
             singular_times=checked_singular_times(self.singular_times, t0, t_end),
+            step=step,
+            first_step=first_step,
+            max_step=max_step,
             method=method,
             tableau=None,
             rtol=checked_rtol(self.rtol, loosest, tightest),
@@ -272,15 +280,16 @@ def _named(name: str, tableau: str | ButcherTableau | None) -> Method:
 def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -> Method:
     """A method object from a name or an object."""
     if isinstance(method, str):
-        if method.lower() not in METHODS:
+        if method.lower() in TABLEAUS:  # as of SciPy's solve_ivp: method="DOP853"
             raise InputError(
-                f"there is no method {safe_repr(method)}",
+                f"{safe_repr(method)} is a tableau, not a method",
                 element="method",
-                remedy=known_names(METHODS),
+                remedy=f'Give tableau="{method.lower()}"',
             )
+        name = choice(method, METHODS, "method")
         if tableau is not None:
             get_tableau(tableau)  # refuses what cannot be looked up
-        return _named(method.lower(), tableau)
+        return _named(name, tableau)
     if tableau is not None:
         raise InputError(
             "tableau is given beside a method object",

@@ -84,7 +84,12 @@ from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import per_model, per_start, per_tree
 from srm_mbs.model.numbers import finite_array
 from srm_mbs.model.validation import START_ARGUMENTS
-from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause, rounding_clause
+from srm_mbs.simulation.failure_causes import (
+    HeldForceWatch,
+    failure_cause,
+    rounding_clause,
+    unrepeatable,
+)
 from srm_mbs.simulation.monitoring import log_end, log_start, progress_of
 from srm_mbs.simulation.options import (
     RunOptions,
@@ -272,12 +277,16 @@ def _make_record(
 
 def lead_with_cause(problem: Problem, record: RunRecord) -> None:
     """Let the message of a run whose steps failed begin with the cause, if it is found."""
-    if record.status is not RunStatus.FAILED or record.error is not None:
+    failed = record.status is RunStatus.FAILED and record.stop_reason is not StopReason.MEMORY
+    if not failed or record.error is not None:
         return
     state = record.run.core.state if isinstance(record, CompiledRecord) else record.last_state
-    q, _ = problem.system.split(state)
+    q, v = problem.system.split(state)
     time = record.end_of_steps().time
     cause = failure_cause(problem.mechanism, time, q, problem.held_watch)
+    if problem.options.controller is not None and problem.options.sample_time is None:
+        force = problem.system.controlled_force
+        cause = unrepeatable(problem.mechanism, force, time, q, v) or cause
     if cause is not None:
         record.lead_with(cause)
 
@@ -913,6 +922,8 @@ class FinishedRun:
         self.backend, self._passages = problem.backend, problem.passages
         self._kernel_system = None if shared(problem.system) else kernel_system
         self._record, self._counters = record, counters
+        if record.status is RunStatus.INTERRUPTED:
+            record.add_pace(options.t_end, _pace_remedy(options))
         if self._passages is not None and self._passages.examined:
             self._passages.ended(record.end_of_steps().time)
         # Before anything reads the dense output, which evaluates stages.
@@ -1076,6 +1087,17 @@ def assemble_result(
     return result
 
 
+def _pace_remedy(options: RunOptions) -> str:
+    """A sentence on the usual reason why the steps of a run are short."""
+    if options.step is not None:
+        return "Give a longer step, or none: steps then follow a tolerance."
+    if not is_split(options.method):
+        return 'Sweeps need shorter steps than method="psrm".'
+    if options.controller is not None and options.sample_time is None:
+        return "Give sample_time to a controller that is noisy, jumps or remembers earlier calls."
+    return "A larger rtol, or forces that change less abruptly, allow longer ones."
+
+
 def _half_turns(names: tuple[str, ...]) -> str:
     """A sentence about the bushings ``names``, which turned by more than half a turn."""
     if not names:
@@ -1088,7 +1110,8 @@ def _half_turns(names: tuple[str, ...]) -> str:
 
 def _driven_too_far(mechanism: Mechanism, record: RunRecord) -> str:
     """A sentence on drives as a possible cause of a failure; empty without them."""
-    if record.status is not RunStatus.FAILED or not mechanism.drives or record.cause is not None:
+    failed = record.status is RunStatus.FAILED and record.stop_reason is not StopReason.MEMORY
+    if not failed or not mechanism.drives or record.cause is not None:
         return ""
     names = ", ".join(drive.name for drive in mechanism.drives)
     return f" A drive ({names}) may lead where the mechanism cannot follow."

@@ -16,7 +16,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.forces import over_half_turn
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.integration.dense_output import StepData, unwrapped_angles
+from srm_mbs.integration.dense_output import StepData, step_bytes, unwrapped_angles
 from srm_mbs.integration.kernel.dense_output import dense_output
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.singular_passages import Bifurcation, find_bifurcations
@@ -136,8 +136,7 @@ class OutputStream:
     ) -> None:
         self._system, self._scheme, self._t_eval = system, scheme, t_eval
         self._made_by = made_by
-        # Rates, and about as much for states, corrections and sigmas.
-        size = 8 * ((scheme.n_stages + 3) * system.tangent_size + 2 * scheme.n_stages)
+        size = step_bytes(scheme, system.tangent_size)
         self.block = int(np.clip(BLOCK_BYTES / size, 4 * GUARD_STEPS, MOST_BLOCK_STEPS))
         self._most_kept = max(self.block, int(KEPT_BYTES / size))
         self._parts: list[StepData] = []

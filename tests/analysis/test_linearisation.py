@@ -190,7 +190,13 @@ def test_inconsistent_rates_are_refused() -> None:
         srm.linearise(mechanism, mechanism.q0, [1.0, 0.0, 0.0])
 
 
-def test_a_linearisation_shows_its_matrices_and_no_object_without_values() -> None:
-    shown = repr(srm.linearise(load("four_bar")))
-    assert "A=array(" in shown
-    assert "object at" not in shown
+def test_a_linearisation_is_one_line_and_its_matrices_are_printed() -> None:
+    found = srm.linearise(load("stewart_platform"))
+    assert repr(found) == (
+        f"Linearisation('stewart_platform', {len(found.coordinates)} coordinates, "
+        f"{len(found.inputs)} inputs, not stable)"
+    )
+    printed = str(found)
+    for matrix in (found.A, found.B, found.drift, found.eigenvalues):
+        assert str(matrix) in printed
+    assert "object at" not in printed

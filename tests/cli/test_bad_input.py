@@ -39,6 +39,7 @@ plot nonsense.npz
 plot none/run.npz
 plot text.npz
 plot run.npz --out drift.gif
+plot run.npz --dpi 0
 play nonsense.npz
 report run.npz --out report.pdf
 report run.npz --rtol 1e-8 --no-second-run

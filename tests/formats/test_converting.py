@@ -209,7 +209,7 @@ def test_the_command_takes_joints_to_cut(tmp_path: Path) -> None:
     ("source", "out", "needle"),
     [
         ("robot.urdf", "out.txt", ".toml"),
-        ("robot.urdf", "none/out.toml", "cannot be written"),
+        ("robot.urdf", "none/out.toml", "none'. Make it first"),
         ("missing.urdf", "out.toml", "no such file"),
         ("robot.urdf", "there.toml", "exists"),
     ],

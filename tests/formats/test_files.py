@@ -6,7 +6,9 @@ import os
 import stat
 import subprocess
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -215,6 +217,34 @@ def test_a_folder_that_is_not_there_is_named_by_the_path_given(tmp_path: Path) -
 
     with pytest.raises(OSError, match=r"no folder.file\.txt"):
         write_text(path, "text")
+
+
+WRITES: dict[str, Callable[[Path], object]] = {
+    "save": lambda folder: pendulum_run().save(folder / "run.npz"),
+    "csv": lambda folder: pendulum_run().to_csv(folder / "run.csv"),
+    "plot": lambda folder: pendulum_run().plot(folder / "run.png"),
+    "page": lambda folder: pendulum_run().export_html(folder / "run.html"),
+    "report": lambda folder: pendulum_run().report(folder / "run.html", again=False),
+    "convert": lambda folder: srm.convert("four_bar", folder / "four_bar.toml"),
+}
+
+
+@cache
+def pendulum_run() -> srm.Solution:
+    return srm.simulate(srm.load("simple_pendulum"), 0.1)
+
+
+@pytest.mark.parametrize("name", WRITES)
+def test_whatever_is_written_into_a_missing_folder_says_to_make_it(
+    name: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "results"
+    with pytest.raises((srm.InputError, FileNotFoundError)) as refused:
+        WRITES[name](folder)
+    assert f"there is no folder {str(folder)!r}. Make it first" in str(refused.value)
+    folder.mkdir()
+    WRITES[name](folder)
+    assert any(folder.iterdir())
 
 
 @posix

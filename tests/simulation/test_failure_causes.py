@@ -50,6 +50,56 @@ def test_an_unstable_sampled_controller_is_the_cause_that_a_run_names(
 
 
 @on_both
+def test_a_noisy_controller_is_the_cause_that_a_run_names(backend: str) -> None:
+    noise = np.random.default_rng(0)
+
+    def noisy(t: float, q: Any, v: Any) -> Any:
+        return [0.0, 1e6 * noise.normal(), 0.0]
+
+    options: dict[str, Any] = {"backend": backend, "controller": noisy}
+    with pytest.warns(FailedRunWarning):
+        solution = srm.simulate(load("four_bar"), 1e6, max_step=1e-3, **options)
+    assert re.search(
+        r"the controller is not a function of t, q and v: called twice there, it returned \S+ and "
+        r"\S+ for the joint 'coupler'\. .* Give sample_time",
+        solution.message,
+    )
+    held = srm.simulate(load("four_bar"), 0.1, sample_time=T, **options)
+    assert held.success
+
+
+@on_both
+def test_an_interrupted_run_says_how_many_steps_remain_and_what_shortens_them(
+    backend: str,
+) -> None:
+    def interrupt(t: float, h: float, state: Any) -> None:
+        if t > 0.0:
+            raise KeyboardInterrupt
+
+    def remaining(t_end: float, **options: Any) -> tuple[float, str]:
+        solution = srm.simulate(load("four_bar"), t_end, progress=interrupt, **options)
+        assert solution.status == "interrupted"
+        said = re.search(r"step was (\S+) s long; (\S+) such steps remain\.(.*)", solution.message)
+        assert said is not None
+        length = solution.steps.times[-1] - solution.steps.times[-2]
+        assert float(said[1]) == pytest.approx(length, rel=0.06)
+        return float(said[2]) * length / (t_end - solution.t[-1]), said[3]
+
+    few, said = remaining(1.0, backend=backend)
+    assert few == pytest.approx(1.0, rel=0.06)
+    assert not said
+    for options, remedy in (
+        ({"controller": lambda t, q, v: [0.0, 0.0, 0.0]}, "Give sample_time"),
+        ({"step": 1e-3}, "Give a longer step"),
+        ({}, "A larger rtol"),
+    ):
+        many, said = remaining(1e6, backend=backend, **options)
+        assert many == pytest.approx(1.0, rel=0.06)
+        assert remedy in said
+    assert 'method="psrm"' in remaining(1e6, method="srm")[1]
+
+
+@on_both
 def test_a_simulator_names_forces_that_grow_with_every_step(backend: str) -> None:
     simulator = srm.Simulator(load("four_bar"), backend=backend)
     law = damper(1000.0)

@@ -256,6 +256,26 @@ def test_invalid_options_are_refused_before_any_stepping(four_bar: srm.Mechanism
     check_messages("options", messages)
 
 
+@pytest.mark.parametrize("option", ["method", "tableau", "backend", "placement"])
+def test_names_of_options_have_one_spelling(four_bar: srm.Mechanism, option: str) -> None:
+    name = {"method": "psrm", "tableau": "dop853", "backend": "python", "placement": "automatic"}
+    chosen: dict[str, Any] = {option: name[option]}
+    assert srm.simulate(four_bar, 0.1, **chosen).success
+    chosen = {option: name[option].upper()}
+    with pytest.raises(srm.InputError, match=rf"there is no {option} .*{name[option]}") as wrong:
+        srm.simulate(four_bar, 0.1, **chosen)
+    assert wrong.value.element == option
+
+
+@pytest.mark.parametrize("name", ["DOP853", "dopr54"])
+def test_a_tableau_in_place_of_a_method_is_told_where_it_belongs(
+    four_bar: srm.Mechanism, name: str
+) -> None:
+    remedy = f'is a tableau, not a method. Give tableau="{name.lower()}"'
+    with pytest.raises(srm.InputError, match=remedy):
+        srm.simulate(four_bar, 0.1, method=name)
+
+
 def test_an_assembly_as_initial_state_is_told_which_part_of_it_to_give(
     four_bar: srm.Mechanism,
 ) -> None:

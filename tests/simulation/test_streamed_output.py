@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
+from srm_mbs.integration.kernel import driver
 from srm_mbs.simulation import streamed_output
 from tests.support.backends import on_both
 from tests.support.bundled import load
@@ -146,3 +148,30 @@ def test_ten_thousand_turns_with_two_output_times_take_little_memory() -> None:
     assert steps > 100_000
     # The steps alone would take 600 bytes each.
     assert megabytes < 100.0
+
+
+def test_a_run_whose_steps_would_fill_the_memory_ends_and_says_to_give_output_times(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mechanism = load("squeezing_mechanism")  # whose motor has no limit: ever more steps a second
+    whole = srm.simulate(mechanism, 2.0)
+    monkeypatch.setattr(driver, "MOST_STEP_BYTES", 2e7)
+    with pytest.warns(srm.FailedRunWarning):
+        ended = srm.simulate(mechanism, 2.0)
+    assert not ended.success
+    assert "of the memory of this machine. Everything up to there is kept. Give t_eval" in (
+        ended.message
+    )
+    count = len(ended.t)
+    assert 1000 < count < len(whole.t)
+    np.testing.assert_array_equal(ended.t, whole.t[:count])
+    np.testing.assert_array_equal(ended.q, whole.q[:count])
+    motor = srm.Drive(srm.ConstantSpeed(6.0), joint="crank")
+    driven = replace(load("slider_crank_regular"), drives=(motor,))
+    driven = driven.with_state(srm.assemble(driven).q, srm.assemble(driven).v)
+    with pytest.warns(srm.FailedRunWarning):
+        turning = srm.simulate(driven, 1e6, max_step=1e-3)
+    assert turning.message.endswith("the run then keeps no other state.")
+    sampled = srm.simulate(mechanism, 2.0, t_eval=[1.0, 2.0])
+    assert sampled.success
+    np.testing.assert_array_equal(sampled.q, whole([1.0, 2.0])[0])

@@ -167,6 +167,12 @@ def _error(solution: SimulationResult, estimate: ErrorEstimate) -> tuple[Grade, 
             "smaller, but there is no tighter run to show by how much."
         )
     end = min(solution.span[1], float(estimate.comparison.t[-1]))
+    if not estimate.comparison.largest:
+        return grade, (
+            f"The comparison run has the same numbers up to t = {end:.6g} s: the mechanism rests, "
+            "or samples, breakpoints or max_step bound the steps of both, which then meet the "
+            "tighter tolerance as well."
+        )
     return grade, (
         f"No joint is off by more than about {sizes} up to t = {end:.6g} s. This is an estimate, "
         "the difference to a tighter run, and no proven bound."

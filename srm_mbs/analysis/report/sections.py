@@ -363,12 +363,14 @@ def _energy(certificate: Certificate) -> list[tuple[str, str]]:
 def _estimate(solution: SimulationResult, estimate: ErrorEstimate) -> dict[str, Any]:
     """Estimated error of each joint, the runs that were compared, and the plot over time."""
     units = solution.mechanism.structure.units
-    plot = _plot_image(
-        draw_errors(solution, estimate.comparison),
-        "Plot: difference to the other run over time",
-        f"The difference over time, positions over 1 rad or {units.length:.3g} m, rates over those "
-        f"times {units.rate:.3g}/s.",
-    )
+    plot = None
+    if estimate.comparison.largest:
+        plot = _plot_image(
+            draw_errors(solution, estimate.comparison),
+            "Plot: difference to the other run over time",
+            f"The difference over time, positions over 1 rad or {units.length:.3g} m, rates over "
+            f"those times {units.rate:.3g}/s.",
+        )
     return {
         "meaning": _meaning(estimate),
         "joints": [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from srm_mbs.errors import ControllerError, EvaluationError, EventError
 from srm_mbs.integration import driver
 from srm_mbs.integration.breakpoints import BreakpointHandler
 from srm_mbs.integration.critical_passages import CriticalPassages, ExaminedPassage
-from srm_mbs.integration.dense_output import StepData
+from srm_mbs.integration.dense_output import StepData, step_bytes
 from srm_mbs.integration.driver import EndOfSteps, RunRecord, StepSink, Tick
 from srm_mbs.integration.events import EventWatch
 from srm_mbs.integration.kernel.events import CompiledEventWatch
@@ -163,6 +164,7 @@ def integrate(
     started = time.perf_counter()
     one_by_one = tick is not None or events is not None
     core = run.core
+    size = step_bytes(run.method.scheme, system.tangent_size)
     try:
         if events is not None:
             events.begin(run.t0, start)
@@ -185,6 +187,10 @@ def integrate(
                 continue
             if reason not in (ReturnReason.CHUNK_FULL, ReturnReason.FINISHED):
                 failure = why_stopped(reason, system, run)
+                record.mark_failed(failure, core.t, core.h, core.memory().sigma, run.adaptive)
+                break
+            if core.count * size > MOST_STEP_BYTES and reason is ReturnReason.CHUNK_FULL:
+                failure = _out_of_memory(core.count, size)
                 record.mark_failed(failure, core.t, core.h, core.memory().sigma, run.adaptive)
                 break
             if not one_by_one or core.count == made:
@@ -215,6 +221,27 @@ def integrate(
     system.count(run.kernel_system.evaluations, run.kernel_system.factorisations)
     record.wall_time = time.perf_counter() - started
     return record
+
+
+def _physical_memory() -> float:
+    """Memory of this machine (bytes); infinite where the system does not say."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):  # Windows has no sysconf
+        return np.inf
+
+
+MOST_STEP_BYTES = 0.5 * _physical_memory()
+"""Size of the steps at which a run ends, before the system ends the program."""
+
+
+def _out_of_memory(count: int, size: int) -> RunFailure:
+    """The failure of a run with ``count`` steps of ``size`` bytes."""
+    return RunFailure(
+        StopReason.MEMORY,
+        f"its {count} steps take {count * size / 1e9:.2g} GB, half of the memory of this machine",
+        "Give t_eval, the output times: the run then keeps no other state",
+    )
 
 
 def why_stopped(

@@ -19,6 +19,7 @@ from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.compiled_rows import closure_structs
 from srm_mbs.dynamics.singularities import critical
+from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.integration import (
     breakpoints,
     critical_passages,
@@ -537,7 +538,19 @@ def force_struct(
     curves: Sequence[dict[str, Any]] = (),
     **own: Any,
 ) -> Any:
-    """``ForceElement`` of forces.hpp; the fields that its kind has not are zero or empty."""
+    """``ForceElement`` of forces.hpp; the fields that its kind has not are zero or empty.
+
+    Raises
+    ------
+    InputError
+        If the kernel has no formulas of that kind, as of an element that is being added.
+    """
+    if kind not in FORCE_KINDS:
+        raise InputError(
+            f"the kernel has no force element {safe_repr(kind)}",
+            element="backend",
+            remedy='Use backend="python", or add it to FORCE_KINDS, forces.hpp and forces.cpp',
+        )
     columns = np.flatnonzero(support)
     return _core.ForceElement(
         kind=FORCE_KINDS.index(kind),

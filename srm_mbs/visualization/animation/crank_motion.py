@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.manifold import joint_track
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.dynamics.scaling import is_angle, joint_track
+from srm_mbs.dynamics.scaling import is_angle
 
 
 @dataclass(frozen=True)

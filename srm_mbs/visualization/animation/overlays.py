@@ -1,4 +1,4 @@
-"""Overlays of an animation: springs, paths of points, gaps and reactions of closures.
+"""Overlays of an animation: springs, massless rods, paths of points, gaps and reactions.
 
 All of them are computed at the key frames of the bodies, and drawn during their active intervals.
 """
@@ -22,7 +22,7 @@ from srm_mbs.model.forces import SpringDamper
 from srm_mbs.model.numbers import flag
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.animation.arrows import Arrows, arrows_of
-from srm_mbs.visualization.animation.shapes import Colour, Cylinder, Mesh, Shape, Sphere
+from srm_mbs.visualization.animation.shapes import Colour, Cylinder, Mesh, Shape, Sphere, rods
 from srm_mbs.visualization.animation.trajectory import (
     ActiveIntervals,
     BodyMotion,
@@ -35,6 +35,7 @@ from srm_mbs.visualization.animation.trajectory import (
 
 SPRING_COLOUR: Colour = (0.35, 0.38, 0.42, 1.0)
 DAMPER_COLOUR: Colour = (0.60, 0.63, 0.67, 1.0)
+ROD_COLOUR: Colour = SPRING_COLOUR
 GAP_COLOUR: Colour = (0.835, 0.0, 0.35, 1.0)
 TRACE_COLOURS: tuple[Colour, ...] = (
     (0.835, 0.369, 0.000, 1.0),
@@ -64,7 +65,8 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """The overlays of an animation, image or video: those that are requested beside springs.
+    """The overlays of an animation, image or video: those that are requested beside springs and
+    massless rods.
 
     The methods that show a motion (:class:`srm_mbs.JointMotion`) take them by these names, as does
     the command line.
@@ -117,7 +119,9 @@ class ViewOptions:
 
 
 NO_OVERLAYS = ViewOptions()
-"""Springs only."""
+"""Springs and massless rods only."""
+ALONG_Z = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.5]))
+"""Placement of a cylinder from 0 to 1 on z."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,12 +189,20 @@ def active_springs(
     )
 
 
+def active_rods(motion: DrawableMotion) -> list[tuple[LoopClosure, ActiveIntervals | None]]:
+    """The closures that are drawn as :func:`~srm_mbs.visualization.animation.shapes.rods`, with
+    active intervals."""
+    return active_elements(motion, rods)
+
+
 def overlay_joints(motion: DrawableMotion, options: ViewOptions) -> set[int]:
     """Indices of the joints whose motion :func:`make_overlays` reads."""
     model = motion.mechanism.model
     anchors = options.anchors(motion.mechanism)
     for spring, _ in active_springs(motion):
         anchors += [spring.a.resolve(model), spring.b.resolve(model)]
+    for rod, _ in active_rods(motion):
+        anchors += rod.resolve(model)
     if options.arrows:
         return set(range(1, model.njoints))
     if options.reactions or options.gaps:
@@ -202,7 +214,7 @@ def overlay_joints(motion: DrawableMotion, options: ViewOptions) -> set[int]:
 def make_overlays(
     motion: DrawableMotion, options: ViewOptions, bodies: BodyMotion, extent: float
 ) -> Overlays:
-    """Springs, and the requested overlays, at the key frames of ``bodies``.
+    """Springs, massless rods, and the requested overlays, at the key frames of ``bodies``.
 
     Parameters
     ----------
@@ -226,6 +238,10 @@ def make_overlays(
         ends = [bodies.path(*side.resolve(model)) for side in (spring.a, spring.b)]
         drawn = _spring(f"spring_{number}", spring, ends, extent)
         out.shapes.append(replace(drawn, active=active))
+    for number, (rod, active) in enumerate(active_rods(motion)):
+        a, b = (bodies.path(*side) for side in rod.resolve(model))
+        part = Cylinder(0.006 * extent, 1.0), ALONG_Z, ROD_COLOUR
+        out.shapes.append(replace(_stretched(f"rod_{number}", (part,), a, b - a), active=active))
     for number, (joint, placement) in enumerate(options.anchors(motion.mechanism)):
         points = bodies.path(joint, placement)
         colour = TRACE_COLOURS[number % len(TRACE_COLOURS)]

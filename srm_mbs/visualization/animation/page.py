@@ -64,7 +64,9 @@ FLOAT32_ARRAY = 0x17
 """Type of an array of single precision in the MessagePack of msgpack-lite, with which meshcat
 reads."""
 DIGITS = 4
-"""Significant digits of a value in the page, which shows three."""
+"""Significant digits of a value in the page, which shows three; and of its range, for curves."""
+CONSTANT = 1e-9
+"""Range of a value, over its size, that is rounding."""
 
 
 def page_data(motion: DrawableMotion, picture: Picture, *, panel: bool = True) -> dict[str, Any]:
@@ -201,7 +203,12 @@ def values_over_time(solution: SimulationResult, times: FloatArray) -> dict[str,
 
 
 def _rounded(samples: FloatArray) -> list[float | None]:
-    return [float(f"{x:.{DIGITS}g}") if math.isfinite(x) else None for x in samples.tolist()]
+    known = samples[np.isfinite(samples)]
+    size, extent = np.abs(known).max(initial=0.0), np.ptp(known) if len(known) else 0.0
+    digits = DIGITS
+    if extent > CONSTANT * size:
+        digits += max(0, math.ceil(math.log10(size / extent)))
+    return [float(f"{x:.{digits}g}") if math.isfinite(x) else None for x in samples.tolist()]
 
 
 def values_over_crank(motion: CrankPositions) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.visualization.animation.overlays import (
     Overlays,
     ViewOptions,
+    active_rods,
     active_springs,
     make_overlays,
     overlay_joints,
@@ -157,7 +158,7 @@ def make_picture(
     loops = active_closures(motion)
     visuals = visuals_of(mechanism, loops)
     joints = {visual.joint for visual in visuals} - {0} | overlay_joints(motion, options)
-    others = 2 * len(active_springs(motion)) + len(options.trace)
+    others = 2 * (len(active_springs(motion)) + len(active_rods(motion))) + len(options.trace)
     others += len(loops) * (2 * options.gaps + 2 * options.reactions)
     bodies = sample_motion(motion, tuple(sorted(joints)), fps, others, extra)
     points = points_in_view(visuals, bodies)

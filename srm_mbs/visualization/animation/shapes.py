@@ -323,6 +323,15 @@ def _skeleton(
     return out
 
 
+def rods(mechanism: Mechanism) -> list[LoopClosure]:
+    """The closures that keep the distance of two points: massless rods, which no body shows."""
+    return [
+        loop
+        for loop in mechanism.loops
+        if loop.rows.distances and loop.rows.count == len(loop.rows.distances)
+    ]
+
+
 def bar_ends(
     mechanism: Mechanism, loops: Sequence[LoopClosure]
 ) -> tuple[list[list[FloatArray]], list[int]]:

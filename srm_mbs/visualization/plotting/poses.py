@@ -27,7 +27,7 @@ from srm_mbs.integration.dense_output import checked_time
 from srm_mbs.model.anchors import Anchor, one_degree_joint
 from srm_mbs.model.numbers import finite_array
 from srm_mbs.simulation.result import SimulationResult
-from srm_mbs.visualization.animation.shapes import bar_ends
+from srm_mbs.visualization.animation.shapes import bar_ends, rods
 from srm_mbs.visualization.plotting.figure import (
     BLACK,
     BLUE,
@@ -192,7 +192,7 @@ def plane_normal(mechanism: Mechanism) -> tuple[float, ...] | None:
 def _direction(view: Any) -> tuple[float, ...]:
     if isinstance(view, str) and view in LOOKS:
         return LOOKS[view]
-    numbers = None if isinstance(view, str) else finite_array(view, (3,))
+    numbers = finite_array(view, (3,))
     if numbers is None or not np.linalg.norm(numbers) > 0.0:
         raise InputError(
             f"{safe_repr(view)} is not a direction of view",
@@ -342,6 +342,16 @@ def _draw_pose(
                 "zorder": 2.3 + strength,
             }
             axes.plot(*tips.T, color=_pale(VERMILION, strength), **dot)
+    for rod in rods(mechanism):
+        sides = rod.resolve(model)
+        world = np.array(
+            [
+                placed.origin[0, joint] + placed.rotation[0, joint] @ inside.translation
+                for joint, inside in sides
+            ]
+        )
+        line = finite(picture.of(world))
+        axes.plot(*line.T, color=_pale(GREY, strength), linewidth=1.2, zorder=2.0 + strength)
     return np.concatenate(corners)
 
 

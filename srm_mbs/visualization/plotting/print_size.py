@@ -61,7 +61,7 @@ def checked_size(size: Any) -> Size:
     """
     if isinstance(size, str) and size in WIDTHS:
         return size
-    numbers = None if isinstance(size, str) else finite_array(size, (2,))
+    numbers = finite_array(size, (2,))
     if numbers is None or not np.all((numbers > 0.0) & (numbers <= LARGEST_SIZE)):
         raise InputError(
             f"{safe_repr(size)} is not the size of a figure",

@@ -442,6 +442,21 @@ def test_an_open_chain_has_pictures_of_the_reactions_of_its_joints() -> None:
     assert found["missing"] == []
 
 
+def test_runs_of_the_same_steps_have_no_error_of_zero_and_no_empty_picture() -> None:
+    sampled = srm.simulate(
+        load("four_bar"), 0.5, controller=lambda t, q, v: [-v[0], 0.0, 0.0], sample_time=2e-3
+    )
+    certificate = srm.certify(sampled)
+    [error] = [part for part in certificate.findings if part.topic == "estimated error"]
+    assert "samples, breakpoints or max_step bound the steps of both" in error.text
+    assert "0.0e+00 rad" not in error.text
+    page = Page(report_page(sampled, pictures=[], certificate=certificate))
+    assert not any("difference to the other run" in words for words in page.alternatives)
+    free = srm.simulate(load("four_bar"), 0.5)
+    page = Page(report_page(free, pictures=[], certificate=srm.certify(free)))
+    assert any("difference to the other run" in words for words in page.alternatives)
+
+
 def test_the_largest_reactions_are_listed_with_their_times(tmp_path: Path) -> None:
     solution = srm.simulate(load("four_bar"), 1.0)
     rows = {name: cells for name, *cells in run_data(solution)["reactions"]}

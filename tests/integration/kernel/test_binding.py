@@ -37,6 +37,11 @@ def test_every_constant_has_to_be_given() -> None:
             core.Constants(**{key: value for key, value in given.items() if key != name})
 
 
+def test_a_force_element_that_the_kernel_has_not_is_refused_with_the_backend_that_has_it() -> None:
+    with pytest.raises(srm.InputError, match=r"no force element 'drag'\. Use backend=.python"):
+        marshalling.force_struct(kind="drag")
+
+
 def test_an_unknown_field_is_refused() -> None:
     with pytest.raises(TypeError, match="Constants has no field tolerance"):
         core.Constants(**fields(marshalling.CONSTANTS), tolerance=1.0)

@@ -606,6 +606,36 @@ def test_springs_reach_from_anchor_to_anchor_and_closures_have_the_colour_of_the
 
 
 @pytest.mark.browser
+def test_massless_rods_reach_from_anchor_to_anchor_in_page_picture_and_poses(
+    browser: Any, tmp_path: Path
+) -> None:
+    linkage = srm.planar(
+        points={"O": (0, 0), "A": (0, 1), "C": (2, 0), "B": (2, 1.5)},
+        bars={"crank": ("O", "A"), "rocker": ("C", "B")},
+        ground=("O", "C"),
+        mass_per_length=1.0,
+    )
+    a, b = linkage.points["A"], linkage.points["B"]
+    rod = srm.LoopClosure("distance", a, b, length=math.hypot(2.0, 0.5), name="rod")
+    tied = linkage.with_loop(rod)
+    solution = srm.simulate(tied, 1.0)
+    with exported(browser, tmp_path, solution, fps=64.0) as page:
+        for t in (0.0, 0.515625, 1.0):
+            [(start, end)] = ends_in(page, "rod_", t)
+            assert np.abs(start - place(solution, t, a)).max() < 1e-6
+            assert np.abs(end - place(solution, t, b)).max() < 1e-6
+    without = srm.simulate(linkage, 0.01)
+    assert [
+        shape.name for shape in make_picture(solution, 60.0, ViewOptions()).overlays.shapes
+    ] == ["rod_0"]
+    assert not make_picture(without, 60.0, ViewOptions()).overlays.shapes
+    ends = np.array([place(solution, 0.5, side)[[0, 2]] for side in (a, b)])
+    [axes] = solution.plot(kind="poses", at=[0.5], view="y").axes[:1]
+    lines = [np.array(line.get_xydata()) for line in axes.lines]
+    assert any(line.shape == (2, 2) and np.allclose(line, ends, atol=1e-9) for line in lines)
+
+
+@pytest.mark.browser
 def test_gaps_are_drawn_as_many_times_larger_as_the_panel_says(
     browser: Any,
     tmp_path: Path,
@@ -868,6 +898,20 @@ def test_bodies_and_paths_of_a_mechanism_that_travels_far_stay_before_the_camera
             assert len(middles) >= 4
             assert np.abs(middles).max() < 3.0
             assert min(np.linalg.norm(np.array(ball) - middle) for middle in middles) < 1.0 + 1e-3
+
+
+def test_a_value_that_hardly_varies_has_the_digits_that_its_curve_needs() -> None:
+    mechanism = load("four_bar")
+    start = srm.assemble(mechanism, v={"crank": 0.1})
+    solution = srm.simulate(mechanism, 0.01, q0=start.q, v0=start.v)
+    times = np.linspace(0.0, 0.01, 50)
+    angles = {name: solution.at(times).joint(name)[0] for name in mechanism.joint_names}
+    shown = {
+        value["label"]: value["samples"] for value in values_over_time(solution, times)["values"]
+    }
+    for name, angle in angles.items():
+        assert np.ptp(angle) < 2e-3  # four digits would make it a staircase
+        np.testing.assert_allclose(shown[name], angle, rtol=0.0, atol=1e-3 * np.ptp(angle))
 
 
 def test_marks_of_many_loops_or_many_passages_have_their_times_only() -> None:

@@ -282,3 +282,21 @@ def test_a_drive_that_leads_beyond_its_dead_point_ends_the_run_there() -> None:
     assert not solution.success
     assert "the drive 'slider' is at its dead point" in solution.message
     assert solution.t[-1] == pytest.approx(0.5 * np.pi, abs=2e-3)
+
+
+@on_both
+@pytest.mark.parametrize("rtol", [1e-4, 1e-9])
+@pytest.mark.parametrize("short", [-1e-4, -0.01, -0.1])
+def test_a_run_that_stops_at_a_dead_point_says_when_and_which_drive_and_nothing_of_stiffness(
+    short: float, rtol: float, backend: str
+) -> None:
+    """The slider, at 3.5 m - short - 0.5 m cos(2 t), is at 4 m there."""
+    mechanism = towards_the_dead_point(short)
+    solution = srm.simulate(mechanism, 2.0, rtol=rtol, backend=backend)
+    assert not solution.success
+    exact = 0.5 * np.arccos(-1.0 - 2.0 * short)
+    assert solution.t[-1] == pytest.approx(exact, abs=1e-5)
+    assert f"Stopped at t = {solution.t[-1]:.6g} s: the drive 'slider' is" in solution.message
+    assert "the joint 'slider' is at 4 m, and the closures let it go to 4 m" in solution.message
+    assert "stiff" not in solution.message.lower()
+    assert solution.settings.stiff == ()

@@ -19,6 +19,10 @@ namespace srm {
 
 namespace {
 
+bool any(const std::vector<double>& flags) {
+    return std::any_of(flags.begin(), flags.end(), [](double flag) { return flag != 0.0; });
+}
+
 // A view of `values`, which `owner` keeps alive.
 template <typename Values>
 nb::object view(const Values& values, std::initializer_list<std::size_t> shape, nb::handle owner) {
@@ -481,16 +485,13 @@ void bind_run(nb::module_& m) {
         .def_prop_ro("summary",
                      [](const PyRecords& r) {
                          const StepRecords& s = r.records;
-                         const auto any = [](const std::vector<double>& flags) {
-                             return std::any_of(flags.begin(), flags.end(),
-                                                [](double flag) { return flag != 0.0; });
-                         };
                          double least = infinity;
                          for (double sigma : s.sigmas)
                              if (sigma < least) least = sigma;
                          return nb::make_tuple(s.ranks.size(), s.zones.size(), least, any(s.held),
                                                any(s.stiff));
                      })
+        .def_prop_ro("stiff", [](const PyRecords& r) { return any(r.records.stiff); })
         .def_prop_ro("break_count", [](const PyRecords& r) { return r.records.breaks.size(); })
         // Whether dense output needs no more than the records: there are steps, but no breakpoint
         // and no zone, and no step past a critical configuration.

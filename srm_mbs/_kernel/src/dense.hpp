@@ -83,6 +83,9 @@ public:
     // within `allowed` (n,).
     void between_ends(System& system, const double* t, long k, const double* allowed, double* out);
 
+    const StepArrays& steps() const { return steps_; }
+    // Numbers of sigma in each step.
+    long sigma_width() const { return static_cast<long>(schemes_[0].abscissae.size()); }
     static constexpr int most_nodes = 16;  // of a polynomial
 
 private:

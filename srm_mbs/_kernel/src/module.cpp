@@ -11,6 +11,7 @@
 #include "regular_start.hpp"
 #include "separated_rows.hpp"
 #include "sigma_dips.hpp"
+#include "turns.hpp"
 
 using namespace srm;
 
@@ -45,6 +46,7 @@ void bind_structs(nb::module_& m) {
     bind_struct<SchemeDense>(m, "SchemeDense");
     bind_struct<DenseConstants>(m, "DenseConstants");
     bind_struct<DipSearch>(m, "DipSearch");
+    bind_struct<TurnSearch>(m, "TurnSearch");
     bind_struct<EventConstants>(m, "EventConstants");
     bind_struct<BranchCurve>(m, "BranchCurve");
 }

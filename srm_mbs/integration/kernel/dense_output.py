@@ -22,7 +22,12 @@ from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import CompiledObservables, separated_rows
 from srm_mbs.integration.kernel.system import make_kernel_system, shared, workspace
 from srm_mbs.integration.methods.butcher import ButcherTableau
-from srm_mbs.integration.singular_passages import ConstraintMonitor, RecordedDips, Turn
+from srm_mbs.integration.singular_passages import (
+    AVOIDED_SIGMA,
+    ConstraintMonitor,
+    RecordedDips,
+    Turn,
+)
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_start
 
@@ -248,14 +253,17 @@ def dips_in_records(
     records, stop = dense.recorded
     if analysis.sigma_reference < SMALL_REFERENCE_PIVOT or records.stiff:
         return None
+    # Of driven mechanisms, layers that steps resolve are looked for as well.
+    _, _, least_sigma, *_ = records.summary
+    nothing = None if system.mechanism.drives and least_sigma < AVOIDED_SIGMA else ()
     found = core.dips_of_records(_dip_search(scheme), records, stop)  # type: ignore[union-attr]
     if found is None:
-        return ()
+        return nothing
     dips = RecordedDips(*found)
     told = dense.turns(scheme, dips)
     if told is None:
         return dips
-    return told if len(told.tops) or told.turns else ()
+    return told if len(told.tops) or told.turns else nothing
 
 
 def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> BoolArray:

@@ -600,8 +600,8 @@ class RecordedDips:
     tops: IndexArray
     turns: Sequence[Turn] | None = None
 
-    def told(self, others: IndexArray, turns: Sequence[Turn]) -> RecordedDips:
-        """The same with the minima ``others`` (k,) that are at no turn, and these ``turns``."""
+    def at_no_turn(self, others: IndexArray, turns: Sequence[Turn]) -> RecordedDips:
+        """The minima ``others`` (k,), and the ``turns`` found among the rest."""
         return RecordedDips(self.samples[others], self.tops[others], turns)
 
 
@@ -697,12 +697,14 @@ def recorded_turns(
     not before."""
     every = np.arange(len(dips.tops))
     if monitor.geometry.drives or np.logical_or.reduce(steps.stiff):
-        return dips.told(every, ())
+        return dips.at_no_turn(every, ())
     columns = scheme.member(False).distinct
     stages, samples = len(columns), dips.samples
-    # A turn beyond may show as two minima.
-    doubled = np.flatnonzero(samples[:-1, 2] == samples[1:, 0])
-    lowest, highest = np.append(doubled, every), np.append(doubled + 1, every)
+    # A turn beyond may show as several minima, one next to the other.
+    starts = np.flatnonzero(np.append(True, samples[1:, 0] != samples[:-1, 2]))
+    ends = np.append(starts[1:], len(every)) - 1
+    several = ends > starts
+    lowest, highest = np.append(starts[several], every), np.append(ends[several], every)
     first, last = (
         (np.maximum(samples[lowest, 0] - 1, 0)) // stages,
         (samples[highest, 2] - 1) // stages,
@@ -717,7 +719,7 @@ def recorded_turns(
     own = np.flatnonzero(alone)
     found, t, q = _reversals(monitor, steps, first[own], last[own])
     if not len(found):
-        return dips.told(every, ())
+        return dips.at_no_turn(every, ())
     found = own[found]
     lowest, highest, first, last = (values[found] for values in (lowest, highest, first, last))
     tops = dips.tops[lowest]
@@ -739,14 +741,14 @@ def recorded_turns(
         certain &= value * recorded_side > untouched * side
     taken: set[int] = set()
     turns = []
-    for i in np.flatnonzero(certain).tolist():  # those of two minima first
-        minima = {int(lowest[i]), int(highest[i])}
+    for i in np.flatnonzero(certain).tolist():  # those of several minima first
+        minima = set(range(lowest[i], highest[i] + 1))
         if minima & taken:
             continue
         taken |= minima
         if values[0, i] < 0.0:
             turns.append(Turn(times[:, i].tolist(), values[:, i].tolist(), int(tops[i])))
-    return dips.told(np.delete(every, list(taken)), turns)
+    return dips.at_no_turn(np.delete(every, list(taken)), turns)
 
 
 def _times_around(

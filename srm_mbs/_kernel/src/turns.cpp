@@ -40,10 +40,12 @@ public:
         const auto& dips = recorded.dips;
         const std::size_t n = dips.size();
         Turns out{std::vector<char>(n), {}};
-        for (std::size_t i = 0; i < n; ++i) {
-            // A turn beyond may show as two dips.
-            if (i + 1 < n && dips[i][2] == dips[i + 1][0] && turns(recorded, i, i + 1, out)) ++i;
-            else turns(recorded, i, i, out);
+        for (std::size_t first = 0, next; first < n; first = next) {
+            next = first + 1;
+            while (next < n && dips[next - 1][2] == dips[next][0]) ++next;
+            // A turn beyond may show as several dips, one next to the other.
+            if (next > first + 1 && turns(recorded, first, next - 1, out)) continue;
+            for (std::size_t i = first; i < next; ++i) turns(recorded, i, i, out);
         }
         return out;
     }

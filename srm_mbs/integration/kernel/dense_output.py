@@ -122,7 +122,7 @@ class CompiledDenseOutput(DenseOutput):
         return self._evaluated(lambda kernel_system: read(kernel_system, times, *allowed))  # type: ignore[no-any-return]
 
     def _evaluated(self, read: Callable[[Any], Any]) -> Any:
-        """What ``read`` returns of a kernel system of the mechanism."""
+        """``read`` of a kernel system of the mechanism, whose work is counted."""
         if self.kernel_system is not None:
             return self._counted(self.kernel_system, read)
         code = code_of_record(self._made_by, self._mechanism_system.mechanism)
@@ -151,7 +151,7 @@ class CompiledDenseOutput(DenseOutput):
                 others, turns = self._evaluated(lambda own: self._compiled.turns(own, *given))
         except ArithmeticError:
             return None
-        return dips.told(others, [Turn(*turn) for turn in turns])
+        return dips.at_no_turn(others, [Turn(*turn) for turn in turns])
 
     @cached_property
     def _by_reference(self) -> bool:
@@ -260,10 +260,10 @@ def dips_in_records(
     if found is None:
         return nothing
     dips = RecordedDips(*found)
-    told = dense.turns(scheme, dips)
-    if told is None:
+    others = dense.turns(scheme, dips)
+    if others is None:
         return dips
-    return told if len(told.tops) or told.turns else nothing
+    return others if len(others.tops) or others.turns else nothing
 
 
 def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> BoolArray:

@@ -97,8 +97,10 @@ def linearised(
     rate, laws, directions = terms.rate().copy(), system.laws, np.eye(n)
     along = on_branch and not terms.rank_deficient
     if along:
-        tangents = [e - terms.project(e) for e in np.eye(k)]
-        directions[:k, :k] = directions[k:, k:] = np.transpose(tangents)
+        size = n - k  # of positions and of rates, or of all unknowns
+        tangents = np.transpose([e - terms.project(e) for e in np.eye(size)])
+        for start in range(0, n, size):
+            directions[start : start + size, start : start + size] = tangents
     applied = laws if memory.laws is None else memory.laws
     m = len(applied)
     system.apply_laws(applied if m else None)

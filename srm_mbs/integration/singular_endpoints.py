@@ -505,12 +505,28 @@ def _rates(geometry: ClosureGeometry, v: FloatArray) -> str:
     return ", ".join(parts)
 
 
+def _nearest_rates(singular: SingularConfiguration, u: FloatArray) -> str:
+    """In words, the rates next to u (n,), in units, that belong to a branch; empty if there are
+    none.  With drives, time passes at its own rate."""
+    geometry = singular.geometry
+    size = float(np.abs(u).max())
+    near = singular.onto_branch(u) if size > 0.0 else u
+    if singular.branch(near) is None or not (
+        np.abs(singular.curvature(near)).max() <= TANGENCY_TOLERANCE * size**2
+    ):
+        return ""
+    unit = geometry.coordinate_unit
+    if geometry.drives:
+        near = near * (u[-1] / near[-1])
+    return f"the nearest rates along a branch are ({_rates(geometry, near[: len(unit)] * unit)})"
+
+
 def describe_branches(singular: SingularConfiguration, u: FloatArray) -> str:
     """The branches at a singular configuration in words: ratios of the joint rates."""
     geometry = singular.geometry
     tangents = branch_tangents(singular, u if np.any(u) else None)
     if not len(tangents):
-        return "its branches cannot be listed"
+        return _nearest_rates(singular, u) or "its branches cannot be listed"
     unit = geometry.coordinate_unit
     listed = [
         _rates(geometry, tangent[: len(unit)] * unit) for tangent in tangents[:BRANCHES_LISTED]

@@ -19,7 +19,7 @@ Both are found after the run, on its dense output.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Collection, Generator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TypeVar
@@ -82,6 +82,9 @@ UNTOUCHED_VALUE = 2.0 * TOUCHING_VALUE
 """The same part from which a motion that turned back certainly did not."""
 VANISHING_TOGETHER = 2.0
 """Singular values up to this multiple of the smallest vanish with it."""
+AVOIDED_SIGMA = 0.4
+"""sigma where a motion is closest to a critical configuration from which it passes none: the layer
+is so wide that the motion in it is a regular one, whether or not it is followed along its curve."""
 RECORDED_DEPTH = 0.75
 """Largest of the lowest sigmas between recorded samples, over those at the sides, of a minimum that
 is examined: sigma differs from the singular values by some per cent."""
@@ -352,7 +355,8 @@ class Crossing:
     kind
         ``"passed"``: the motion went straight on, through a singular configuration; or
         ``"avoided"``: the closures have a residual where their branches almost cross, and the
-        motion followed the data past it.
+        motion followed the data past it, with sigma below 0.4 where it was closest.  So does that
+        of a drive that turns back short of its dead point.
     """
 
     time: float
@@ -839,9 +843,55 @@ def _crossings_along_curves(monitor: ConstraintMonitor, steps: StepData) -> list
             critical = monitor.critical(time)
         if critical is None:
             continue
+        if monitor.geometry.drives:
+            # Where a drive turns back sigma is flat, and the ends of steps are far apart.
+            around = steps.times[max(lowest - 1, 0)], after
+            time = _closest(monitor, np.linspace(*around, SAMPLES))
         beside = 0.25 * float(steps.times[last] - steps.times[first])
         kind = "avoided" if monitor.follows(critical) else "passed"
-        found.append(crossing_at(monitor, steps, time, beside, kind))
+        if kind == "passed" or steps.sigmas[lowest, -1] < AVOIDED_SIGMA:
+            found.append(crossing_at(monitor, steps, time, beside, kind))
+    return found
+
+
+def _resolved_dips(scheme: ButcherTableau, steps: StepData) -> list[int]:
+    """Indices of the recorded minima of sigma below AVOIDED_SIGMA."""
+    _, sigma = _recorded(scheme, steps)
+    inner = sigma[1:-1]
+    lowest = (inner <= sigma[:-2]) & (inner < sigma[2:]) & (inner < AVOIDED_SIGMA)
+    return (np.flatnonzero(lowest) + 1).tolist()
+
+
+def _avoided_by_steps(
+    monitor: ConstraintMonitor,
+    scheme: ButcherTableau,
+    steps: StepData,
+    dips: Sequence[int],
+    listed: Collection[float],
+) -> list[Crossing]:
+    """The critical configurations that the motion of a driven mechanism avoided at those of the
+    recorded ``dips`` next to which no passage is ``listed`` (s).
+
+    Where a drive turns back, steps may resolve a layer that others follow along the curve.
+    """
+    t, _ = _recorded(scheme, steps)
+    found: list[Crossing] = []
+    for k in dips:
+        first, last = max(k - DIP_WIDTHS[-1], 0), min(k + DIP_WIDTHS[-1], len(t) - 1)
+        times = np.linspace(t[first], t[last], SAMPLES)
+        known = (*listed, *(crossing.time for crossing in found))
+        if any(times[0] <= time <= times[-1] for time in known) or _along_curve(steps, t[k]):
+            continue
+        values = monitor.smallest(times)
+        lowest = int(values.argmin())
+        if not 0 < lowest < len(times) - 1:
+            continue
+        near = slice(lowest - 1, lowest + 2)
+        time = monitor.minimum(times[near], values[near])
+        if monitor.is_regular(time, times[near][[0, 2]].tolist()) or not monitor.avoids(time):
+            continue
+        beside = 0.25 * float(times[-1] - times[0])
+        found.append(crossing_at(monitor, steps, time, beside, "avoided"))
     return found
 
 
@@ -903,7 +953,9 @@ def find_crossings(
         t, _ = _recorded(scheme, steps)
         values = monitor.smallest(t)
         recorded = _dips(t, values / np.median(values), scheme.n_stages)
-    if recorded is None and not steps.critical_ranges:
+    driven = analysis.geometry(analysis.split(steps.states[0])[0], float(steps.times[0])).drives
+    resolved = _resolved_dips(scheme, steps) if driven else []
+    if recorded is None and not steps.critical_ranges and not resolved:
         return ()
     monitor = monitor or ConstraintMonitor(analysis, *monitored())
     searches = []
@@ -920,6 +972,8 @@ def find_crossings(
     for crossings in (*monitor.together(searches), _crossings_along_curves(monitor, steps)):
         for crossing in crossings:
             found.setdefault(crossing.time, crossing)
+    for crossing in _avoided_by_steps(monitor, scheme, steps, resolved, found):
+        found[crossing.time] = crossing
     return tuple(found[time] for time in sorted(found))
 
 

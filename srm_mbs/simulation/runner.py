@@ -694,7 +694,10 @@ def integrate_problem(
 def _starts_too_fast(record: RunRecord, options: RunOptions) -> bool:
     """Whether a run that may take implicit steps stopped because the first step that it chose is
     below round-off."""
-    if record.stop_reason is not StopReason.ROUND_OFF or len(record.times):
+    if record.stop_reason is not StopReason.ROUND_OFF or record.rest is not None:
+        return False
+    end = record.end_of_steps()
+    if end.last_time > end.start:
         return False
     scheme = options.method.scheme
     implicit = scheme.implicit is not None or scheme.stiff is not None

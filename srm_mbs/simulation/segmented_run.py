@@ -17,7 +17,6 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
-from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import EvaluationError, EventError, InputError, get_logger, safe_repr
 from srm_mbs.integration.contacts import Contact, ContactProbe
 from srm_mbs.integration.driver import RunStatus
@@ -32,6 +31,7 @@ from srm_mbs.integration.events import (
 )
 from srm_mbs.integration.kernel.events import contact_probe
 from srm_mbs.integration.kernel.system import Evaluator, SuccessiveWorkspaces
+from srm_mbs.integration.methods.branch_nodes import onto_closed_branch
 from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
 from srm_mbs.model.numbers import positive_number
@@ -534,7 +534,9 @@ def _after_actions(
     try:
         # The dense output is on the closures within the tolerance only.
         if not _closed(known, t, x):
-            x = onto_closures(part.system if controller is None else make_system(mechanism), t, x)
+            x = onto_closed_branch(
+                part.system if controller is None else make_system(mechanism), t, x
+            )
     except EvaluationError as error:
         raise EventError(f"no action could be taken: {error}") from error
     for event, times in zip(events, part.t_events or []):
@@ -637,7 +639,7 @@ def _switched(
     new = new.with_drive_curves(_curves_from(t, mechanism, new))
     given = new.start_state
     system = make_system(new)
-    x = onto_closures(system, t, given)
+    x = onto_closed_branch(system, t, given)
     if system.position_norm(system.difference(given, x)) > LARGEST_PROJECTION:
         check_consistent(new, t, names=STATE_ARGUMENTS)
     nq = new.model.nq

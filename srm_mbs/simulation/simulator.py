@@ -14,7 +14,6 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.controllers import HeldForce, forces_of_joints
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
-from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import (
     ControllerError,
     EvaluationError,
@@ -27,6 +26,7 @@ from srm_mbs.integration.generated.policy import charge, code_of_run
 from srm_mbs.integration.kernel.backend import COMPILED, chosen_backend, code_is_compiled
 from srm_mbs.integration.messages import FailureCause
 from srm_mbs.integration.methods.base import Method
+from srm_mbs.integration.methods.branch_nodes import onto_closed_branch
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.numbers import positive_number, real_array
 from srm_mbs.model.validation import STATE_ARGUMENTS
@@ -376,7 +376,7 @@ class Simulator:
         if project:
             try:
                 given = self._mechanism.moved(q, v).start_state
-                state = onto_closures(self._system, t, given)
+                state = onto_closed_branch(self._system, t, given)
             except EvaluationError as error:
                 raise InputError(
                     f"the state cannot be projected: {error}",

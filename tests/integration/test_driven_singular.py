@@ -36,12 +36,15 @@ def slid(angle: float, law: str = "slider") -> srm.Mechanism:
     return replace(load("slider_crank_slider"), drives=(drive,), q0=q, v0=v)
 
 
-def towards_the_dead_point(short: float) -> srm.Mechanism:
-    """The slider goes from 3 m to ``short`` (m) of 4 m, where the bars are in line, and back."""
-    law = srm.Sine(0.5, omega=2.0, phase=-0.5 * np.pi, offset=3.5 - short)
+def towards_the_dead_point(short: float, omega: float = 2.0, swing: float = 0.5) -> srm.Mechanism:
+    """The slider goes by twice its ``swing`` (m) to ``short`` (m) of 4 m, where the bars are in
+    line, and back."""
+    start = 4.0 - short - 2.0 * swing
+    law = srm.Sine(swing, omega=omega, phase=-0.5 * np.pi, offset=start + swing)
     drive = srm.Drive(law, "slider", absolute=True)
     mechanism = replace(load("slider_crank_slider"), drives=(drive,))
-    state = srm.assemble(mechanism, [-0.8, 1.6, 3.0 - short])
+    angle = np.arccos(0.25 * start)
+    state = srm.assemble(mechanism, [-angle, 2.0 * angle, start])
     return mechanism.with_state(state.q, state.v)
 
 
@@ -269,6 +272,28 @@ def test_a_drive_that_stops_short_of_its_dead_point_turns_the_bars_back(short: f
     assert crank[-1] == pytest.approx(-np.arccos(0.25 * slider), abs=1e-7)
 
 
+@on_both
+@pytest.mark.parametrize(("swing", "omega"), [(0.1, 0.3), (0.1, 10.0), (0.5, 2.0), (1.0, 0.3)])
+@pytest.mark.parametrize("short", [0.05, 0.015, 0.003, 1e-4, 1e-6])
+def test_a_drive_that_turns_back_avoids_its_dead_point_alike_at_every_tolerance(
+    short: float, swing: float, omega: float, backend: str
+) -> None:
+    """The passage is listed where sigma falls below 0.4: whether or not steps resolve the turn, at
+    half a period."""
+    seen = set()
+    for rtol in (1e-5, 1e-6, 1e-8):
+        mechanism = towards_the_dead_point(short, omega, swing)
+        solution = srm.simulate(mechanism, 4.0 / omega, rtol=rtol, backend=backend)
+        assert solution.success, solution.message
+        listed = [crossing.kind for crossing in solution.crossings]
+        assert listed == (["avoided"] if short < 0.05 else [])
+        for crossing in solution.crossings:
+            assert crossing.time * omega == pytest.approx(np.pi, abs=2e-3)
+            assert crossing.drives == ("slider",)
+            seen.add(round(abs(crossing.residual), 12))
+    assert len(seen) <= 1
+
+
 def test_a_dead_point_within_the_tolerance_is_passed_and_its_drive_is_named() -> None:
     """Momentum carries the bars on: which way they go differs by less than the tolerance."""
     (crossing,) = srm.simulate(towards_the_dead_point(1e-10), 2.0, rtol=1e-6).crossings
@@ -282,3 +307,21 @@ def test_a_drive_that_leads_beyond_its_dead_point_ends_the_run_there() -> None:
     assert not solution.success
     assert "the drive 'slider' is at its dead point" in solution.message
     assert solution.t[-1] == pytest.approx(0.5 * np.pi, abs=2e-3)
+
+
+@on_both
+@pytest.mark.parametrize("rtol", [1e-4, 1e-9])
+@pytest.mark.parametrize("short", [-1e-4, -0.01, -0.1])
+def test_a_run_that_stops_at_a_dead_point_says_when_and_which_drive_and_nothing_of_stiffness(
+    short: float, rtol: float, backend: str
+) -> None:
+    """The slider, at 3.5 m - short - 0.5 m cos(2 t), is at 4 m there."""
+    mechanism = towards_the_dead_point(short)
+    solution = srm.simulate(mechanism, 2.0, rtol=rtol, backend=backend)
+    assert not solution.success
+    exact = 0.5 * np.arccos(-1.0 - 2.0 * short)
+    assert solution.t[-1] == pytest.approx(exact, abs=1e-5)
+    assert f"Stopped at t = {solution.t[-1]:.6g} s: the drive 'slider' is" in solution.message
+    assert "the joint 'slider' is at 4 m, and the closures let it go to 4 m" in solution.message
+    assert "stiff" not in solution.message.lower()
+    assert solution.settings.stiff == ()

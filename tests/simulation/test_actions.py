@@ -11,6 +11,7 @@ import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
+from tests.support import reduced
 from tests.support.backends import on_both
 from tests.support.bundled import load
 from tests.support.snapshots import check_messages, refused
@@ -557,3 +558,50 @@ def test_forces_of_a_drive_that_lets_go_are_those_of_its_time() -> None:
     )
     assert read.drive_forces["crank"][1] == 0.0
     np.testing.assert_array_equal(read.drive_rates["crank"], [4.0, 0.0, 4.0])
+
+
+# --- next to singular configurations ------------------------------------------------------------
+
+BESIDE = [-1e-4, -1e-7, -1e-9, 0.0, 1e-12, 1e-8, 1e-6, 1e-3]
+"""Times (s) between a passage through a singular configuration and an action."""
+
+
+@on_both
+@pytest.mark.parametrize("name", ["slider_crank", "parallelogram"])
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6])
+def test_an_action_beside_a_singular_configuration_leaves_the_motion_on_its_branch(
+    name: str, rtol: float, backend: str
+) -> None:
+    """Each one slows the mechanism down, or turns it back, in proportion: along its branch."""
+    mechanism = load(name)
+    field = {"slider_crank": reduced.slider_crank, "parallelogram": reduced.parallelogram}[name]()
+    start = [float(mechanism.q0[0]), float(mechanism.v0[0])]
+    passage = srm.simulate(mechanism, 1.5, rtol=1e-10).crossings[0].time
+    along = np.array({"slider_crank": [1.0, -2.0], "parallelogram": [1.0, -1.0, 1.0]}[name])
+    for beside, factor in zip(BESIDE, [0.8, -0.5] * 4):
+        at, t_end = passage + beside, passage + 0.5
+        given: list[np.ndarray] = []
+
+        def act(t: float, q: Any, v: Any, factor: float = factor, given: Any = given) -> Any:
+            given.append(v)
+            return q, factor * v
+
+        event = srm.Event(clock(at), action=act)
+        run = srm.simulate(mechanism, t_end, events=event, rtol=rtol, backend=backend)
+        assert run.success, run.message
+        angle, rate = reduced.integrate(field, start, at)
+        exact = reduced.integrate(field, [angle, factor * rate], t_end - at)
+        assert abs(run.q[-1, 0] - exact[0]) < 0.01 * rtol
+        assert abs(run.v[-1, 0] - exact[1]) < 0.01 * rtol
+        assert np.abs(given[0] - given[0][0] * along).max() < 1e-8
+
+
+@on_both
+def test_an_action_that_leads_off_every_branch_is_refused_with_the_branches(backend: str) -> None:
+    mechanism = load("slider_crank")
+    passage = srm.simulate(mechanism, 1.5, rtol=1e-10).crossings[0].time
+    event = srm.Event(clock(passage), action=lambda t, q, v: (q, [v[0], -1.5 * v[0]]))
+    run = srm.simulate(mechanism, 1.5, events=event, backend=backend)
+    assert run.status == "failed"
+    assert run.t[-1] == pytest.approx(passage, abs=1e-9)
+    assert "its velocity is not tangent to any branch: 2 branches cross there" in run.message

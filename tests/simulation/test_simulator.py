@@ -212,6 +212,21 @@ def test_states_off_the_closures_can_be_projected(slider_crank: srm.Mechanism) -
     simulator.step(0.1)
 
 
+@pytest.mark.parametrize("beside", [0.0, 1e-9, -1e-7, 1e-5])
+def test_states_beside_a_singular_configuration_are_projected_onto_their_branch(
+    beside: float,
+) -> None:
+    """Those of a run are 1e-9 off it; the bars of this parallelogram stay parallel."""
+    parallelogram = srm.load("parallelogram")
+    run = srm.simulate(parallelogram, 0.5)
+    q, v = run(run.crossings[0].time + beside)
+    simulator = srm.Simulator(parallelogram)
+    simulator.set_state(q, v, project=True)
+    moved, rate = simulator.q, simulator.v
+    assert np.abs(moved - q).max() < 1e-9
+    assert np.abs(rate - rate[0] * np.array([1.0, -1.0, 1.0])).max() < 1e-9
+
+
 @on_both
 def test_a_failed_step_raises_and_leaves_the_last_good_state(
     slider_crank: srm.Mechanism, backend: str

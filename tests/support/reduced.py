@@ -127,26 +127,29 @@ def spatial_dead_point() -> Field:
     return field
 
 
-def index_one(mechanism: Mechanism) -> Field:
+def index_one(mechanism: Mechanism, steady: tuple[str, ...] = ()) -> Field:
     """q' = v, M v' + G^T lam = f, G v' = -Gdot v: the unstabilised index-1 equations, flat q.
 
     Pinocchio's terms, a dense KKT solve; redundant rows left out.  What a user would integrate
-    with SciPy.
+    with SciPy.  The joints ``steady`` turn at constant speed.
     """
     model = mechanism.model
     assert model.nq == model.nv
     data = model.createData()
     structure = mechanism.structure
     rows = LoopKinematics(model, mechanism.loops, structure.row_scale, structure.kept)
-    nv, m = model.nv, len(rows.g)
+    nv = model.nv
+    held = np.eye(nv)[[model.joints[model.getJointId(joint)].idx_v for joint in steady]]
+    m = len(rows.g) + len(held)
 
     def field(t: float, x: Any) -> np.ndarray:
         q, v = x[:nv], x[nv:]
         pin.crba(model, data, q, pin.Convention.WORLD)
         pin.nonLinearEffects(model, data, q, v)
         rows.update(data, q, v)
-        kkt = np.block([[data.M, rows.G.T], [rows.G, np.zeros((m, m))]])
-        right = np.concatenate([-data.nle - model.damping * v, -rows.bias])
+        G = np.concatenate([rows.G, held])
+        kkt = np.block([[data.M, G.T], [G, np.zeros((m, m))]])
+        right = np.concatenate([-data.nle - model.damping * v, -rows.bias, np.zeros(len(held))])
         return np.concatenate([v, np.linalg.solve(kkt, right)[:nv]])
 
     return field

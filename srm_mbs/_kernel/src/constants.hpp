@@ -75,6 +75,8 @@ namespace srm {
     field(double, rate_overflow)           /* rates from which products may overflow */            \
     field(double, first_step_probe)        /* relative change that the first step may make */      \
     field(double, longest_first_step)      /* over the probing step */                             \
+    field(double, at_rest)                 /* change of rates at rest, over the probing step */    \
+    field(double, rest_factor)             /* of the times at which its end is looked for */       \
     field(double, clock_rounding)          /* of the end of a step, over its length, that counts */ \
     /* Placement: control/placement.py. */                                                         \
     field(double, max_sigma_change)        /* per step */                                          \

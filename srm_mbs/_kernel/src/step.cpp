@@ -60,19 +60,37 @@ double initial_step(System& system, const ErrorNorm& norm, double t, const doubl
     if (!std::isfinite(d1)) throw EvaluationError{Failure::not_finite};
     if (!(d1 > 0.0)) return constants.first_step_probe * span;
     const double h0 = std::min(constants.first_step_probe * d0 / d1, span);
-    for (int i = 0; i < n; ++i) error[i] = h0 * rate[i];
-    system.retract(state, error.data(), x.data());
-    system.evaluate(t + h0, x.data(), System::ZoneView{});
-    system.rate(there.data());
-    system.chart_rate(error.data(), there.data(), probed.data());
-    for (int i = 0; i < n; ++i) probed[i] -= rate[i];
-    const double d2 = ErrorNorm::ratio(probed.data(), weights.data(), n) / h0;
+    // Size of the change of the rates over `ahead` (s), with the state moving on or not.
+    const auto change = [&](double ahead, double moves) {
+        for (int i = 0; i < n; ++i) error[i] = moves * ahead * rate[i];
+        system.retract(state, error.data(), x.data());
+        system.evaluate(t + ahead, x.data(), System::ZoneView{});
+        system.rate(there.data());
+        system.chart_rate(error.data(), there.data(), probed.data());
+        for (int i = 0; i < n; ++i) probed[i] -= rate[i];
+        return ErrorNorm::ratio(probed.data(), weights.data(), n);
+    };
+    const double d2 = change(h0, 1.0) / h0;
     if (!std::isfinite(d2)) throw EvaluationError{Failure::not_finite};
     const double longest = constants.longest_first_step * h0;
     if (!(d2 > 0.0)) return std::min(longest, span);
-    const double tau = d1 / d2;
-    const double change = constants.first_step_probe / (tau * d1);
-    return std::min({longest, tau * std::pow(change, 1.0 / order), span});
+    double tau = d1 / d2, faster = d1;
+    if (tau < constants.at_rest * h0 && change(h0, 0.0) > 0.5 * h0 * d2) {
+        // The time scale of the change of the rates with time, and the change over it.
+        const double shortest = tau, factor = constants.rest_factor;
+        for (tau = h0; tau > shortest;) tau /= factor;
+        faster = change(tau, 0.0);
+        while (tau < h0) {
+            const double further = change(factor * tau, 0.0);
+            if (tau * faster > constants.first_step_probe && further < faster * std::sqrt(factor))
+                break;
+            tau *= factor;
+            faster = further;
+        }
+        faster = std::max(faster, constants.first_step_probe / tau);
+    }
+    const double part = constants.first_step_probe / (tau * faster);
+    return std::min({longest, tau * std::pow(part, 1.0 / order), span});
 }
 
 IntegratorState first_stage(System& system, double t, const double* state) {

@@ -24,6 +24,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.projection import cholesky, unwhiten, whiten
 from srm_mbs.dynamics.singularities.local_analysis import (
+    VANISHING,
     SingularConfiguration,
     analyse_singular,
     determined_solution,
@@ -305,11 +306,15 @@ def steepest(singular: SingularConfiguration, tangent: FloatArray, u: FloatArray
     """The shortest velocity (n,) in the branch that leaves the singular configurations as u does.
 
     ``tangent`` (n, d) is the branch's tangent space, u (n,) a velocity in it, all in units.
-    Motions that no closure restricts, such as that of a free base, are left out.
+    Motions that no closure restricts, such as that of a free base, are left out.  Where the forms
+    do not vanish on that space the branches are a cone, which has it along u alone.
     """
     null = singular.null
-    normal = null - tangent @ (tangent.T @ null)
-    effects = np.array([(singular.hessians(t) @ normal).ravel() for t in tangent.T]).T
+    effects = np.array([singular.hessians(t) @ null for t in tangent.T])
+    if np.abs(effects @ (null.T @ tangent)).max() <= VANISHING:
+        null = null - tangent @ (tangent.T @ null)
+        effects = np.array([singular.hessians(t) @ null for t in tangent.T])
+    effects = effects.reshape(len(effects), -1).T
     wanted = effects @ (tangent.T @ u)
     return tangent @ determined_solution(effects, wanted)
 

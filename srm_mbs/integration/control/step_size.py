@@ -7,6 +7,7 @@ The decision on a step is separate from making it.  One control may wrap another
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
@@ -35,6 +36,11 @@ PROBE_LENGTH = 0.01
 by itself; the change that the first step may make."""
 LONGEST_FIRST = 100.0
 """Longest first step, over that probe."""
+AT_REST = 1e-6
+"""Time in which rates would change by themselves, over the length of the probe, below which they
+may be those of a rest that drives, or forces over time, end."""
+REST_FACTOR = 4.0
+"""Ratio of the times at which the end of the rest is looked for."""
 CLOCK_ROUNDING = 1e-10
 """Rounding of the time at the end of a step, over the length of the step, from which it counts."""
 UNEVALUATED_ERROR_RATIO = 1e6
@@ -307,6 +313,9 @@ def initial_step(
 
     With d0 = ||unit of x||, d1 = ||x'|| and d2 = ||x''|| (an Euler step of 0.01 d0/d1), and the
     time tau = d1/d2: h = min(d0/d1, tau (0.01 / (tau d1))^(1/k)).
+
+    At rest d1 is rounding, or next to it, and tau says nothing.  Where only the passing of time
+    changes the rates there, tau is the time scale of that, and d1 the change of the rates over it.
     """
     weights = norm.weights(memory.state_scale)
     # |x| itself may vanish; at the size atol / rtol both tolerances allow the same error.
@@ -320,14 +329,43 @@ def initial_step(
     if not d1 > 0.0:
         return PROBE_LENGTH * span
     h0 = min(PROBE_LENGTH * d0 / d1, span)
-    probe = system.retract(state, h0 * memory.rate)
-    rate = system.chart_rate(h0 * memory.rate, system.evaluate(t + h0, probe).rate())
-    with np.errstate(over="ignore"):
-        d2 = norm(rate - memory.rate, weights) / h0
+
+    def change(ahead: float, moves: float = 1.0) -> float:
+        """Size of the change of the rates over ``ahead`` (s), with the state moving on or not."""
+        way = moves * ahead * memory.rate
+        probe = system.retract(state, way)
+        rate = system.chart_rate(way, system.evaluate(t + ahead, probe).rate())
+        with np.errstate(over="ignore"):
+            return norm(rate - memory.rate, weights)
+
+    d2 = change(h0) / h0
     if not np.isfinite(d2):
         raise EvaluationError(_TOO_TIGHT)
     longest = LONGEST_FIRST * h0
     if not d2 > 0.0:
         return min(longest, span)
     tau = d1 / d2
+    if tau < AT_REST * h0 and change(h0, 0.0) > 0.5 * h0 * d2:
+        tau, d1 = _end_of_rest(lambda ahead: change(ahead, 0.0), tau, h0)
     return float(min(longest, tau * (PROBE_LENGTH / (tau * d1)) ** (1.0 / order), span))
+
+
+def _end_of_rest(
+    change: Callable[[float], float], shortest: float, longest: float
+) -> tuple[float, float]:
+    """The time scale (s) of the ``change`` of the rates with time, from ``shortest`` to ``longest``
+    (s), and the change over it, at least one that moves the state by PROBE_LENGTH.
+
+    It is the first time that moves the state by more, and after which the change grows no longer
+    at least like the root of the time: with a drive that swings it is a part of the period.
+    """
+    scale = longest
+    while scale > shortest:
+        scale /= REST_FACTOR
+    found = change(scale)
+    while scale < longest:
+        further = change(REST_FACTOR * scale)
+        if scale * found > PROBE_LENGTH and further < found * REST_FACTOR**0.5:
+            break
+        scale, found = REST_FACTOR * scale, further
+    return scale, max(found, PROBE_LENGTH / scale)

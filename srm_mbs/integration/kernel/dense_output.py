@@ -23,7 +23,12 @@ from srm_mbs.integration.kernel.observables import CompiledObservables, separate
 from srm_mbs.integration.kernel.system import make_kernel_system, shared, workspace
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.run_samples import RunSamples
-from srm_mbs.integration.singular_passages import ConstraintMonitor, RecordedDips, Turn
+from srm_mbs.integration.singular_passages import (
+    AVOIDED_SIGMA,
+    ConstraintMonitor,
+    RecordedDips,
+    Turn,
+)
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_start
 
@@ -267,14 +272,17 @@ def dips_in_records(
     records, stop = dense.recorded
     if analysis.sigma_reference < SMALL_REFERENCE_PIVOT or records.stiff:
         return None
+    # Of driven mechanisms, layers that steps resolve are looked for as well.
+    layers = system.mechanism.drives and records.least_sigma < AVOIDED_SIGMA
+    nothing = None if layers else ()
     found = core.dips_of_records(_dip_search(scheme), records, stop)  # type: ignore[union-attr]
     if found is None:
-        return ()
+        return nothing
     dips = RecordedDips(*found)
     others = dense.turns(scheme, dips)
     if others is None:
         return dips
-    return others if len(others.tops) or others.turns else ()
+    return others if len(others.tops) or others.turns else nothing
 
 
 def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> BoolArray:

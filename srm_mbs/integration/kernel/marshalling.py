@@ -136,6 +136,8 @@ def constants() -> Any:
         rate_overflow=step_size.RATE_OVERFLOW,
         first_step_probe=step_size.PROBE_LENGTH,
         longest_first_step=step_size.LONGEST_FIRST,
+        at_rest=step_size.AT_REST,
+        rest_factor=step_size.REST_FACTOR,
         clock_rounding=step_size.CLOCK_ROUNDING,
         # Placement.
         max_sigma_change=placement.SIGMA_CHANGE,

@@ -23,10 +23,13 @@ the drives' own included.  Only its being smooth matters: from stage to stage it
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.system import BranchSystem
+from srm_mbs.dynamics.system import BranchSystem, System, onto_closures
+from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.methods.touching_branches import (
     StageOnBranch,
     TouchingBranch,
@@ -261,3 +264,25 @@ class StageNodes(BranchNodes):
         if self._touching is None:
             self._touching = TouchingBranch(self._system, *self._start, direction)
         return self._touching.solve(t, state, self)
+
+
+def onto_closed_branch(system: System, t: float, state: FloatArray) -> FloatArray:
+    """``state`` (nx,) moved along the normals onto the closures, or next to a singular
+    configuration onto its branch, velocities by the M-orthogonal projection.
+
+    At a distance d from the singular configuration, the normals of the closures at a state that is
+    e off the branch are turned by e / d against those of the branch.
+
+    Raises
+    ------
+    EvaluationError
+        As :func:`~srm_mbs.dynamics.system.onto_closures`.
+    """
+    branch_system = system.branch_system
+    if branch_system is not None:
+        with suppress(EvaluationError):  # the projection meets it, or does without
+            if branch_system.evaluate(t, state).sigma < BRANCH_SIGMA:
+                nodes = StageNodes(branch_system, t, state, None)
+                if nodes.solve_stage(t, state):
+                    return nodes.state
+    return onto_closures(system, t, state)

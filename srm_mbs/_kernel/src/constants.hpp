@@ -61,6 +61,7 @@ namespace srm {
     field(double, layer_approached)        /* rate of steps whose stages miss one, over the first */ \
     field(double, layer_unresolved)        /* change of a rate that misses one (layers) */         \
     field(double, difference)              /* by a coordinate, over its size */                    \
+    field(double, near_difference)         /* longer by this over a small sigma */                 \
     field(double, time_difference)         /* by time, over the step */                            \
     field(double, shortest_difference)     /* by time (roundings of t) */                          \
     /* Step-size control: control/step_size.py. */                                                 \

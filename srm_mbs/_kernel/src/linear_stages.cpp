@@ -49,16 +49,21 @@ LinearStages::LinearStages(System& system, double gamma, std::vector<double> uni
       delta_(n_),
       probe_(n_),
       other_(n_),
-      work_(n_) {}
+      work_(n_),
+      on_branch_(x_.size()),
+      error_(n_) {}
 
 void LinearStages::prepare(double t, double h, const double* state,
                            const std::vector<double>& rate,
                            const std::vector<double>& state_scale,
-                           const std::vector<double>& laws, const System::ZoneView& zone) {
+                           const std::vector<double>& laws, const System::ZoneView& zone,
+                           double near_sigma) {
     const bool same = known_ && known_time_ == t && known_rate_ == rate && known_laws_ == laws &&
+                      near_sigma_ == near_sigma &&
                       std::equal(known_state_.begin(), known_state_.end(), state);
     if (!same) {
         known_ = false;
+        near_sigma_ = near_sigma;
         linearise(t, h, state, state_scale, laws, zone);
         known_time_ = t;
         known_rate_ = rate;
@@ -84,12 +89,13 @@ void LinearStages::linearise(double t, double h, const double* state,
     for (int j = 0; j < n; ++j)
         steps[j] = rounded_down(constants_.difference * std::max(unit_[j], state_scale[j]));
     std::fill(delta_.begin(), delta_.end(), 0.0);
-    if (system_.linearise(t, state, &rate_[nv], steps, C_.data(), D_.data(), W_.data(),
-                          L_.data())) {
+    if (!near() && system_.linearise(t, state, &rate_[nv], steps, C_.data(), D_.data(),
+                                     W_.data(), L_.data())) {
         chart_by_coordinates(steps);
     } else {
         system_.law_accelerations(W_.data());
-        if (system_.derivatives(state, &rate_[nv], A_.data(), C_.data(), D_.data()))
+        if (!near() &&
+            system_.derivatives(state, &rate_[nv], A_.data(), C_.data(), D_.data()))
             by_forces(t, state, steps);
         else
             by_differences(t, state, steps, zone);
@@ -113,15 +119,43 @@ void LinearStages::linearise(double t, double h, const double* state,
 void LinearStages::rate_at(double t, const double* state, const System::ZoneView& zone,
                            std::vector<double>& out) {
     system_.evaluate(t, state, zone);
+    if (near()) {
+        std::copy_n(state, on_branch_.size(), on_branch_.begin());
+        project(t, zone);
+    }
     system_.rate(out.data());
+    std::copy_n(state + system_.nq, nv_, out.begin());
+}
+
+// Evaluates on_branch_, evaluated last, at its projection on the closures.
+void LinearStages::project(double t, const System::ZoneView& zone) {
+    for (int i = 0; i < constants_.max_projections; ++i) {
+        const double sigma = system_.sigma();
+        if (system_.rank_deficient() || !(sigma > 0.0)) return;
+        system_.correction(error_.data());
+        if (system_.position_norm(error_.data()) > constants_.ambiguous_offset * sigma) return;
+        const double rounding = constants_.position_rounding / sigma;
+        bool moves = false;
+        for (int k = 0; k < n_; ++k) {
+            moves = moves || std::abs(error_[k]) > rounding * unit_[k];
+            error_[k] = -error_[k];
+        }
+        if (!moves) return;
+        system_.retract(on_branch_.data(), error_.data(), on_branch_.data());
+        system_.evaluate(t, on_branch_.data(), zone);
+    }
 }
 
 // B, C and D with the laws held, and L, from differences of rates.
-void LinearStages::by_differences(double t, const double* state, const std::vector<double>& steps,
+void LinearStages::by_differences(double t, const double* state,
+                                  const std::vector<double>& law_steps,
                                   const System::ZoneView& zone) {
     const int nv = nv_, n = n_, m = count_;
+    const double longer =
+        near_sigma_ > 0.0 ? std::max(1.0, constants_.near_difference / near_sigma_) : 1.0;
     for (int j = 0; j < n; ++j) {
-        const double step = delta_[j] = steps[j];
+        const double step = delta_[j] =
+            longer > 1.0 ? rounded_down(longer * law_steps[j]) : law_steps[j];
         system_.retract(state, delta_.data(), x_.data());
         rate_at(t, x_.data(), zone, probe_);
         const bool position = j < nv;
@@ -131,7 +165,14 @@ void LinearStages::by_differences(double t, const double* state, const std::vect
         }
         double* const column = position ? &C_[j * nv] : &D_[(j - nv) * nv];
         for (int i = 0; i < nv; ++i) column[i] = (probe_[nv + i] - rate_[nv + i]) / step;
-        for (int k = 0; k < m; ++k) L_[j * m + k] = (system_.law_values()[k] - laws_[k]) / step;
+        if (m && law_steps[j] != step) {
+            // Laws, of friction above all, bend sooner than accelerations.
+            delta_[j] = law_steps[j];
+            system_.retract(state, delta_.data(), x_.data());
+            rate_at(t, x_.data(), zone, probe_);
+        }
+        for (int k = 0; k < m; ++k)
+            L_[j * m + k] = (system_.law_values()[k] - laws_[k]) / law_steps[j];
         delta_[j] = 0.0;
     }
 }

@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "constants.hpp"
+#include "limits.hpp"
 #include "system.hpp"
 
 namespace srm {
@@ -21,10 +22,11 @@ public:
 
     // Linearises the system at the start of a step, unless that was done for the step before, and
     // factorises for the step h.  `rate`, `state_scale` (n,), `laws` (m,), or empty: as they are in
-    // the memory.
+    // the memory.  `near_sigma`: sigma of a start next to a singular configuration, where
+    // accelerations are those on the branch; else infinite.
     void prepare(double t, double h, const double* state, const std::vector<double>& rate,
                  const std::vector<double>& state_scale, const std::vector<double>& laws,
-                 const System::ZoneView& zone);
+                 const System::ZoneView& zone, double near_sigma);
     // For a stage with the chart rates x (n,), evaluated with the laws `applied` (m,), where they
     // are `laws`: x = (1 - h gamma J)^-1 (x + (0, W (laws - applied))), and the rates of the laws.
     void solve(double* x, const double* laws, const double* applied, double* law_rates);
@@ -37,6 +39,7 @@ public:
     void linearise_anew(double t, double h, const double* state,
                         const std::vector<double>& state_scale) {
         known_ = false;
+        near_sigma_ = infinity;
         linearise(t, h, state, state_scale, {}, {});
     }
     // J (n, n), column by column, at the start; the laws by the chart coordinates (m, n), and the
@@ -53,7 +56,8 @@ private:
                    const System::ZoneView& zone);
     void rate_at(double t, const double* state, const System::ZoneView& zone,
                  std::vector<double>& out);
-    void by_differences(double t, const double* state, const std::vector<double>& steps,
+    void project(double t, const System::ZoneView& zone);
+    void by_differences(double t, const double* state, const std::vector<double>& law_steps,
                         const System::ZoneView& zone);
     void chart_by_coordinates(const std::vector<double>& steps);
     void by_forces(double t, const double* state, const std::vector<double>& steps);
@@ -65,8 +69,10 @@ private:
     const double gamma_;
     const std::vector<double> unit_;
     const Constants& constants_;
+    bool near() const { return near_sigma_ < infinity; }
+
     bool known_ = false;
-    double known_time_ = 0.0, k_ = 0.0;
+    double known_time_ = 0.0, k_ = 0.0, near_sigma_ = infinity;
     std::vector<double> known_state_, known_rate_, known_laws_;
     std::vector<double> rate_, by_time_, applied_, laws_;
     std::vector<double> A_, B_, C_, D_;   // (nv, nv), column by column; A: accelerations by forces
@@ -75,7 +81,7 @@ private:
     std::vector<double> S_;               // (nv, nv), the blocks of joints that need a chart
     std::vector<double> CS_, factors_;    // (nv, nv)
     std::vector<int> pivots_;
-    std::vector<double> x_, delta_, probe_, other_, work_;
+    std::vector<double> x_, delta_, probe_, other_, work_, on_branch_, error_;
 };
 
 }  // namespace srm

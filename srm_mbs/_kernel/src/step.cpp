@@ -110,6 +110,7 @@ SplitStep::SplitStep(System& system, const ButcherTableau& scheme_, const Consta
       error_(n_),
       moved_(n_),
       uncertainty_(nv_),
+      own_(nv_),
       scratch_(n_),
       noise_(n_) {
     const int s = scheme.stages();
@@ -477,7 +478,8 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
     const Tracking tracking(linear_ ? &system_ : nullptr);
     if (linear_) {
         linear_->prepare(t, h_, state, memory.rate, memory.state_scale, memory.laws,
-                         monitored_ ? branch_.zone : none);
+                         monitored_ ? branch_.zone : none,
+                         monitored_ && branch_.near ? memory.sigma : infinity);
         for (int j = 0; j <= scheme.lead; ++j) {
             std::copy_n(linear_->rate().begin(), n, &r.rates[j * n]);
             r.sigmas[j] = memory.sigma;
@@ -518,11 +520,15 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
         if (monitored_ && branch_.near && fraction > 0.0) {
             // The chart of the rates is that of the stage before it is projected.
             std::copy(delta_.begin(), delta_.end(), rate_.begin());
+            std::copy(x_.end() - nv_, x_.end(), own_.begin());
             const bool moved = project_stage(time, fraction, memory, sigma_change);
             if (end) moved_end_ = moved;
             std::copy(rate_.begin(), rate_.end(), delta_.begin());
         }
         system_.rate(rate_.data());
+        // q' is that of the stage itself, as in the linearised equations.
+        if (linear_ && branch_.near && monitored_ && !end)
+            std::copy(own_.begin(), own_.end(), rate_.begin());
         system_.chart_rate(delta_.data(), rate_.data(), &r.rates[j * n]);
         if (linear_ && !end) linear_rate(j, system_.law_values());
         if (system_.rank_deficient()) {

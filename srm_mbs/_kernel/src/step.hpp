@@ -173,6 +173,7 @@ private:
     std::vector<double> away_;
     Branch branch_;
     std::vector<double> x_, delta_, rate_, weights_, error_, moved_, uncertainty_;
+    std::vector<double> own_;  // (nv,), the rates of a stage before it is projected
     mutable std::vector<double> scratch_, noise_;
     std::vector<int> deficient_stages_;  // stages with fewer rows than the structural rank
 };

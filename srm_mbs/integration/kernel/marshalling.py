@@ -120,6 +120,7 @@ def constants() -> Any:
         layer_approached=reversals.APPROACHED,
         layer_unresolved=reversals.UNRESOLVED,
         difference=linear_split_step.DIFFERENCE,
+        near_difference=linear_split_step.NEAR_DIFFERENCE,
         time_difference=linear_split_step.TIME_DIFFERENCE,
         shortest_difference=linear_split_step.SHORTEST_DIFFERENCE,
         # Step-size control.

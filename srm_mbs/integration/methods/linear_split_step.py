@@ -26,6 +26,11 @@ r = F - y, adds W r to the right-hand side, and the rate of y is r / (h gamma) +
 More laws than degrees of freedom are one, y = M (1 - P) M^-1 B F: closures take up the rest, which
 may grow with c.
 
+**On the branch.**  Next to a singular configuration the accelerations of a stage are those at its
+projection on the closures (:mod:`srm_mbs.integration.methods.near_singular`), a field that is
+smooth along the branch, and D is differentiated as that field: off the closures D changes like
+w^2, and with its J the stages would be pushed off the branch.  q' = v remains that of the stage.
+
 Everything else, the correction at the end, the zone and the placement, is that of explicit steps;
 only stages of motions that linger next to a singular configuration are not solved by nodes of the
 branch.
@@ -39,14 +44,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.system import System, Zone
+from srm_mbs.dynamics.system import System
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Linearisation, StepResult
+from srm_mbs.integration.methods.near_singular import (
+    AMBIGUOUS_DISTANCE,
+    MAX_PROJECTIONS,
+    POSITION_ROUNDING,
+    BranchStages,
+)
 from srm_mbs.integration.methods.split_step import SplitStep, Stages
 from srm_mbs.integration.methods.stiffness import largest_eigenvalue
 from srm_mbs.model.lazy import cached_property
 
 DIFFERENCE = 2.0**-26
 """Step of a difference by a coordinate, over its size: the root of the rounding."""
+NEAR_DIFFERENCE = 0.25
+"""Next to a singular configuration it is longer by NEAR_DIFFERENCE / sigma: accelerations are known
+to rounding / sigma^2 there."""
 TIME_DIFFERENCE = 2.0**-17
 """Step of a difference by time, over that of the integration: the third root of the rounding,
 because that difference is of second order."""
@@ -66,14 +80,29 @@ def linearised(
     state: FloatArray,
     memory: IntegratorState,
     norm: ErrorNorm,
-    zone: Zone | None,
+    branch: BranchStages | None,
 ) -> Linearisation:
-    """``system`` linearised at ``state`` (nx,) and ``t`` (s), for steps of about ``h`` (s)."""
+    """``system`` linearised at ``state`` (nx,) and ``t`` (s), for steps of about ``h`` (s), next to
+    a singular configuration on its ``branch``."""
     n, k = system.tangent_size, system.multiplier_part.start
     unit = norm.one if norm.unit is None else norm.unit
+    zone = None if branch is None else branch.zone
+    near = is_near(branch)
 
     def rate_at(time: float, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        rate = system.evaluate(time, x, zone).rate().copy()
+        terms, v = system.evaluate(time, x, zone), x[len(x) - k :]
+        for _ in range(MAX_PROJECTIONS if near else 0):
+            if terms.rank_deficient or not terms.sigma > 0.0:
+                break
+            error = terms.correction()
+            if system.position_norm(error) > AMBIGUOUS_DISTANCE * terms.sigma:
+                break
+            if not (np.abs(error) > POSITION_ROUNDING / terms.sigma * unit).any():
+                break
+            x = system.retract(x, -error)
+            terms = system.evaluate(time, x, zone)
+        rate = terms.rate().copy()
+        rate[:k] = v
         return rate, system.laws
 
     # The rate of the memory is the one before the last correction, which stiff forces notice.
@@ -82,11 +111,13 @@ def linearised(
     applied = laws if memory.laws is None else memory.laws
     m = len(applied)
     system.apply_laws(applied if m else None)
-    steps = rounded_down(DIFFERENCE * np.maximum(unit, memory.state_scale))
+    law_steps = steps = rounded_down(DIFFERENCE * np.maximum(unit, memory.state_scale))
+    if near and memory.sigma > 0.0:
+        steps = rounded_down(max(1.0, NEAR_DIFFERENCE / memory.sigma) * steps)
     # Accelerations are linear in what acts in place of the laws.
     change = max(1.0, float(np.abs(applied).max(initial=0.0)))
     J, by_coordinates, by_laws = np.zeros((n, n)), np.empty((m, n)), np.zeros((n, m))
-    known = system.derivatives(state, rate[k:])
+    known = None if near else system.derivatives(state, rate[k:])
     held = rate[k:] if known is None else known.forces(t, state)
 
     def probe(step: float, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -99,12 +130,15 @@ def linearised(
         there = np.concatenate([x[len(x) - k :], rate[k:]])
         return there, known.by_forces @ ((forces - held) / step), system.laws
 
-    for j, step in enumerate(steps.tolist()):
+    for j, (step, law_step) in enumerate(zip(steps.tolist(), law_steps.tolist())):
         delta = np.zeros(n)
         delta[j] = step
         there, J[k:, j], own = probe(step, system.retract(state, delta))
         J[:k, j] = (system.chart_rate(delta, there) - rate)[:k] / step
-        by_coordinates[:, j] = (own - laws) / step
+        if m and law_step != step:  # laws, of friction above all, bend sooner than accelerations
+            delta[j] = law_step
+            own = rate_at(t, system.retract(state, delta))[1]
+        by_coordinates[:, j] = (own - laws) / law_step
     if known is not None:
         J[k:] += np.hstack([known.by_positions, known.by_velocities])
     for i in range(m):
@@ -118,7 +152,12 @@ def linearised(
         tau = float(rounded_down(np.array(max(TIME_DIFFERENCE * h, shortest))))
         first, second = (rate_at(t + i * tau, state)[0] - rate for i in (1.0, 2.0))
         by_time = (4.0 * first - second) / (2.0 * tau)
-    return Linearisation(rate, J, by_time, applied, laws, by_coordinates, by_laws)
+    return Linearisation(rate, J, by_time, applied, laws, by_coordinates, by_laws, near)
+
+
+def is_near(branch: BranchStages | None) -> bool:
+    """Whether a step with this ``branch`` is next to a singular configuration."""
+    return branch is not None and branch.near
 
 
 class LinearStages:
@@ -191,7 +230,7 @@ class LinearSplitStep(SplitStep):
         state: FloatArray,
         memory: IntegratorState,
         norm: ErrorNorm,
-        zone: Zone | None,
+        branch: BranchStages | None,
         rates: FloatArray,
     ) -> Stages:
         """See :class:`SplitStep`; the equations are linearised here."""
@@ -200,8 +239,8 @@ class LinearSplitStep(SplitStep):
         scheme, n, implicit = self.scheme, system.tangent_size, self._implicit
         lead, end = scheme.lead, scheme.n_stages
         known = memory.linearisation
-        if known is None:
-            known = linearised(system, t, h, state, memory, norm, zone)
+        if known is None or known.on_branch != is_near(branch):
+            known = linearised(system, t, h, state, memory, norm, branch)
             memory.linearisation = known
         gamma = float(implicit[lead, lead])
         factors = lu_factor(np.eye(n) - h * gamma * known.J, check_finite=False)

@@ -261,7 +261,6 @@ class DaeSystem:
     """
 
     has_constraints = True
-    sigma_scatters = False
     time_dependent = True
     laws = np.zeros(0)
     singularities = None
@@ -281,6 +280,8 @@ class DaeSystem:
         self.nx = len(x0)
         self._unit = np.maximum(1.0, np.abs(x0))
         self.ny = self._count_rows(t0, x0)
+        # The last of three or more pivots jumps where others are taken.
+        self.sigma_scatters = self.ny > 2
         self.shapes = {
             "f": (self.nx,),
             "B": (self.nx, self.ny),

@@ -551,3 +551,49 @@ def test_a_fast_constraint_of_a_long_run_has_its_derivative(t_end: float) -> Non
     for rate in (0.0, 30.3):
         with pytest.raises(srm.InputError, match="by finite differences"):
             srm.solve_dae(with_rate(rate), (0.0, t_end), [0.0, 0.0])
+
+
+@pytest.mark.parametrize("seed", [29, 52, 212])
+def test_a_sigma_that_jumps_with_its_pivots_does_not_stop_the_run(seed: int) -> None:
+    """Three rows g = h(x) - h(x(t)), whose pivots change places, where G B is regular."""
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.integers(4, 6)), 3
+    size, rate, phase = rng.uniform(-1, 1, n), rng.uniform(0.3, 2, n), rng.uniform(0, 6, n)
+    y_size, y_rate = rng.uniform(-1, 1, m), rng.uniform(0.3, 2, m)
+    A, G0, B0 = rng.normal(size=(n, n)), rng.normal(size=(m, n)), 0.3 * rng.normal(size=(n, m))
+    rng.random()
+    Q = 0.3 * rng.normal(size=(m, n))
+
+    def at(t: float) -> np.ndarray:
+        return size * np.sin(rate * t + phase)
+
+    def moving(t: float) -> np.ndarray:
+        return size * rate * np.cos(rate * t + phase)
+
+    def h(x: np.ndarray) -> np.ndarray:
+        return G0 @ x + Q @ np.sin(x)
+
+    def slopes(x: np.ndarray) -> np.ndarray:
+        return G0 + Q * np.cos(x)
+
+    def across(t: float, x: np.ndarray) -> np.ndarray:
+        return (G0 + 0.3 * B0.T).T * (1.0 + 0.06 * np.cos(x[0]))
+
+    def f(t: float, x: np.ndarray) -> np.ndarray:
+        forces = across(t, x) @ (y_size * np.cos(y_rate * t))
+        return moving(t) + forces + 0.5 * A @ (x - at(t))
+
+    problem = srm.SemiExplicitDAE(
+        f=f,
+        B=across,
+        g=lambda t, x: h(x) - h(at(t)),
+        G=lambda t, x: slopes(x),
+        g_t=lambda t, x: -slopes(at(t)) @ moving(t),
+    )
+    products = [slopes(at(t)) @ across(t, at(t)) for t in np.linspace(0.0, 4.0, 401)]
+    least = [np.linalg.svd(product, compute_uv=False)[-1] for product in products]
+    assert min(least) > 0.04
+    run = srm.solve_dae(problem, (0.0, 4.0), at(0.0), tableau="dop853", rtol=1e-4)
+    assert run.success, run.message
+    assert run.stats.steps < 60
+    assert np.abs(run.x[-1] - at(4.0)).max() < 1e-3

@@ -21,7 +21,7 @@ and passes isolated singularities of G B, where P and yhat stay bounded and y ne
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -198,8 +198,45 @@ PROBE_DISTANCE = 0.1
 """Their distance, in units of max(1, |x|)."""
 DIFFERENCE = 1e-6
 """Step of the finite differences that check G and g_t, relative to x and to the run."""
+FINER = tuple(10.0**-k for k in range(9))
+"""Lengths of that step, over the usual one, until the differences settle: x may be of a smaller
+size than its unit, and g vary faster than the run is long."""
+SETTLED = 0.1
+"""They have where their change is that much smaller than their distance from what is given."""
 WRONG_DERIVATIVE = 1e-3
 """Relative difference from which a derivative is called wrong."""
+
+
+def _differs(given: FloatArray, slope: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
+    """Which derivatives ``given`` are not the ``slope``, over that or ``least``."""
+    wrong: NDArray[np.bool_] = np.abs(slope - given) > WRONG_DERIVATIVE * np.maximum(
+        least, np.abs(slope)
+    )
+    return wrong
+
+
+def _other_slope(
+    slope_over: Callable[[float], FloatArray], given: FloatArray, least: FloatArray
+) -> FloatArray | None:
+    """Where differences settle, if that is not at the ``given`` derivatives; None also where the
+    function ends, and there is nothing to compare with."""
+    last: FloatArray | None = None
+    for finer in FINER:
+        try:
+            slope = slope_over(finer)
+        except (CallbackError, EvaluationError):
+            return None
+        if last is not None and ((slope == 0.0) & (last != 0.0)).any():
+            return last  # rounding takes all of the difference
+        wrong = _differs(given, slope, least)
+        if not wrong.any():
+            return None
+        if last is not None:
+            settled = np.abs(slope - last) < SETTLED * np.abs(slope - given)
+            if (wrong & settled).any():
+                return slope
+        last = slope
+    return last
 
 
 class DaeSystem:
@@ -224,7 +261,6 @@ class DaeSystem:
     """
 
     has_constraints = True
-    sigma_scatters = False
     time_dependent = True
     laws = np.zeros(0)
     singularities = None
@@ -244,6 +280,8 @@ class DaeSystem:
         self.nx = len(x0)
         self._unit = np.maximum(1.0, np.abs(x0))
         self.ny = self._count_rows(t0, x0)
+        # The last of three or more pivots jumps where others are taken.
+        self.sigma_scatters = self.ny > 2
         self.shapes = {
             "f": (self.nx,),
             "B": (self.nx, self.ny),
@@ -373,17 +411,16 @@ class DaeSystem:
         """Refuse a G that is not dg/dx: everything else would look right and be wrong."""
         G = self.call("G", t, x)
         for i in range(self.nx):
-            step = np.zeros(self.nx)
-            step[i] = DIFFERENCE * self._unit[i]
-            try:
-                slope = (self.call("g", t, x + step) - self.call("g", t, x - step)) / (2 * step[i])
-            except (CallbackError, EvaluationError):
-                continue  # g ends here; nothing to compare with
-            wrong = np.abs(slope - G[:, i]) > WRONG_DERIVATIVE * np.maximum(
-                self.projection.rows, np.abs(slope)
-            )
-            if wrong.any():
-                row = int(np.argmax(wrong))
+
+            def slope_over(finer: float, i: int = i) -> FloatArray:
+                step = np.zeros(self.nx)
+                step[i] = finer * DIFFERENCE * self._unit[i]
+                ahead, behind = self.call("g", t, x + step), self.call("g", t, x - step)
+                return np.asarray((ahead - behind) / (2.0 * step[i]))
+
+            slope = _other_slope(slope_over, G[:, i], self.projection.rows)
+            if slope is not None:
+                row = int(np.argmax(_differs(G[:, i], slope, self.projection.rows)))
                 raise InputError(
                     f"G[{row}, {i}] = {G[row, i]:.6g} at the start, but dg/dx there is "
                     f"{slope[row]:.6g} by finite differences",
@@ -405,15 +442,15 @@ class DaeSystem:
                 if (np.abs(moved) > 1e-12 * scale).any():
                     return False
             return True
-        dt = DIFFERENCE * span
-        try:
+
+        def slope_over(finer: float) -> FloatArray:
+            dt = finer * DIFFERENCE * span
             g0, g1, g2 = (self.call("g", t0 + k * dt, x) for k in range(3))
-        except (CallbackError, EvaluationError):
-            return True  # nothing to compare with
+            return np.asarray((4.0 * g1 - 3.0 * g0 - g2) / (2.0 * dt))
+
         given = self.call("g_t", t0, x)
-        slope = (4.0 * g1 - 3.0 * g0 - g2) / (2.0 * dt)
-        scale = np.maximum(np.abs(slope), self.projection.rows * self._unit.max() / span)
-        if (np.abs(slope - given) > WRONG_DERIVATIVE * scale).any():
+        slope = _other_slope(slope_over, given, self.projection.rows * self._unit.max() / span)
+        if slope is not None:
             raise InputError(
                 f"g_t = {given} at the start, but dg/dt there is {slope} by finite differences",
                 element="g_t",

@@ -182,7 +182,8 @@ class System(Protocol):
     predicts: bool
     """Whether the exact multiplier is known: False for a DAE whose g_t is needed and not given."""
     sigma_scatters: bool
-    """Whether sigma jumps when other pivots are taken, along the graph of many loops."""
+    """Whether sigma jumps when other pivots are taken, along the graph of many loops or among the
+    rows of a DAE."""
 
     @property
     def wraps(self) -> bool:

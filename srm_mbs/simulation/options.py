@@ -318,14 +318,14 @@ def checked_times(t_eval: Any, t0: float, t_end: float) -> FloatArray | None:
     """Output times within the run, increasing; None if none are given."""
     if t_eval is None:
         return None
-    remedy = f"Give increasing times between {t0:g} and t_end = {t_end:g} s"
+    remedy = f"Give increasing times between {t0:.15g} and t_end = {t_end:.15g} s"
     times = numbers(t_eval, "t_eval", remedy)
     slack = 1e-12 * max(abs(t0), abs(t_end))  # np.arange(4) * 0.1 ends a rounding error after 0.3
     if times.ndim != 1 or (
         times.size and (times.min() < t0 - slack or times.max() > t_end + slack)
     ):
         raise InputError(
-            f"t_eval must be one-dimensional and lie within {t0:g} and t_end",
+            f"t_eval must be one-dimensional and lie within {t0:.15g} and t_end",
             element="t_eval",
             remedy=remedy,
         )
@@ -357,7 +357,7 @@ def checked_singular_times(singular_times: Any, t0: float, t_end: float) -> Floa
     for end in (t0, t_end):
         if np.any(np.abs(times - end) <= slack):
             raise InputError(
-                f"the run starts or ends at {end:g} s, where a step must begin or end",
+                f"the run starts or ends at {end:.15g} s, where a step must begin or end",
                 element="singular_times",
                 remedy=remedy,
             )
@@ -394,7 +394,7 @@ def checked_span(t0: Any, t_end: Any) -> tuple[float, float]:
     end = finite(t_end, "t_end")
     if not end > start:
         raise InputError(
-            f"the run ends at {end:g} s, before it starts at {start:g} s",
+            f"the run ends at {end:.15g} s, before it starts at {start:.15g} s",
             element="t_end",
             remedy="Give a time after t0",
         )

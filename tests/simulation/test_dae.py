@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -499,3 +500,100 @@ def test_the_number_of_sweeps_may_come_from_an_array() -> None:
     method = srm.SRM("erk4", np.arange(5)[3], eps=0.05)
     assert method == srm.SRM("erk4", 3, eps=0.05)
     assert srm.solve_dae(problem_two(), (0.0, 0.1), START_TWO, method=method, step=0.01).success
+
+
+@pytest.mark.parametrize("size", [1e-2, 1e-4, 1e-7])
+def test_derivatives_of_small_states_are_not_taken_for_wrong(size: float) -> None:
+    """x = size (sin t, cos t), y = 1, on sin(x_0/size) + x_1/size = sin(sin t) + cos t."""
+
+    def slopes(t: float, x: np.ndarray) -> np.ndarray:
+        return np.array([np.cos(x[0] / size), 1.0]) / size
+
+    def g_t(t: float, x: np.ndarray) -> float:
+        return -np.cos(np.sin(t)) * np.cos(t) + np.sin(t)
+
+    problem = srm.SemiExplicitDAE(
+        f=lambda t, x: size * np.array([np.cos(t), -np.sin(t)]) + slopes(t, x) * size**2,
+        B=lambda t, x: slopes(t, x) * size**2,
+        g=lambda t, x: np.sin(x[0] / size) + x[1] / size - np.sin(np.sin(t)) - np.cos(t),
+        G=slopes,
+        g_t=g_t,
+    )
+    run = srm.solve_dae(problem, (0.0, 1.0), [0.0, size], rtol=1e-8, atol=1e-8 * size)
+    assert run.success, run.message
+    assert np.abs(run.x[-1] / size - [np.sin(1.0), np.cos(1.0)]).max() < 1e-6
+    assert run.y[-1] == pytest.approx(1.0, abs=1e-5)
+    wrong = replace(problem, G=lambda t, x: 1.01 * slopes(t, x))
+    with pytest.raises(srm.InputError, match="by finite differences"):
+        srm.solve_dae(wrong, (0.0, 1.0), [0.0, size], rtol=1e-8, atol=1e-8 * size)
+
+
+@pytest.mark.parametrize("t_end", [10.0, 1e4, 1e5])
+def test_a_fast_constraint_of_a_long_run_has_its_derivative(t_end: float) -> None:
+    """x_0 = sin(30 t); the event ends the run, whose length decides how g_t is examined."""
+
+    def with_rate(rate: float) -> srm.SemiExplicitDAE:
+        return srm.SemiExplicitDAE(
+            f=lambda t, x: np.array([0.0, 1.0]),
+            B=lambda t, x: np.array([1.0, 0.0]),
+            g=lambda t, x: x[0] - np.sin(30.0 * t),
+            G=lambda t, x: np.array([1.0, 0.0]),
+            g_t=lambda t, x: -rate * np.cos(30.0 * t),
+        )
+
+    def late(t: float, x: np.ndarray) -> float:
+        return float(x[1] - 0.5)
+
+    late.terminal = True  # type: ignore[attr-defined]
+    run = srm.solve_dae(with_rate(30.0), (0.0, t_end), [0.0, 0.0], rtol=1e-7, events=late)
+    assert run.t[-1] == pytest.approx(0.5, abs=1e-9)
+    assert run.x[-1, 0] == pytest.approx(np.sin(15.0), abs=1e-9)
+    for rate in (0.0, 30.3):
+        with pytest.raises(srm.InputError, match="by finite differences"):
+            srm.solve_dae(with_rate(rate), (0.0, t_end), [0.0, 0.0])
+
+
+@pytest.mark.parametrize("seed", [29, 52, 212])
+def test_a_sigma_that_jumps_with_its_pivots_does_not_stop_the_run(seed: int) -> None:
+    """Three rows g = h(x) - h(x(t)), whose pivots change places, where G B is regular."""
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.integers(4, 6)), 3
+    size, rate, phase = rng.uniform(-1, 1, n), rng.uniform(0.3, 2, n), rng.uniform(0, 6, n)
+    y_size, y_rate = rng.uniform(-1, 1, m), rng.uniform(0.3, 2, m)
+    A, G0, B0 = rng.normal(size=(n, n)), rng.normal(size=(m, n)), 0.3 * rng.normal(size=(n, m))
+    rng.random()
+    Q = 0.3 * rng.normal(size=(m, n))
+
+    def at(t: float) -> np.ndarray:
+        return size * np.sin(rate * t + phase)
+
+    def moving(t: float) -> np.ndarray:
+        return size * rate * np.cos(rate * t + phase)
+
+    def h(x: np.ndarray) -> np.ndarray:
+        return G0 @ x + Q @ np.sin(x)
+
+    def slopes(x: np.ndarray) -> np.ndarray:
+        return G0 + Q * np.cos(x)
+
+    def across(t: float, x: np.ndarray) -> np.ndarray:
+        return (G0 + 0.3 * B0.T).T * (1.0 + 0.06 * np.cos(x[0]))
+
+    def f(t: float, x: np.ndarray) -> np.ndarray:
+        forces = across(t, x) @ (y_size * np.cos(y_rate * t))
+        return moving(t) + forces + 0.5 * A @ (x - at(t))
+
+    problem = srm.SemiExplicitDAE(
+        f=f,
+        B=across,
+        g=lambda t, x: h(x) - h(at(t)),
+        G=lambda t, x: slopes(x),
+        g_t=lambda t, x: -slopes(at(t)) @ moving(t),
+    )
+    products = [slopes(at(t)) @ across(t, at(t)) for t in np.linspace(0.0, 4.0, 401)]
+    least = [np.linalg.svd(product, compute_uv=False)[-1] for product in products]
+    assert min(least) > 0.04
+    run = srm.solve_dae(problem, (0.0, 4.0), at(0.0), tableau="dop853", rtol=1e-4)
+    assert run.success, run.message
+    assert run.stats.steps < 60
+    assert np.abs(run.x[-1] - at(4.0)).max() < 1e-3

@@ -454,3 +454,11 @@ def test_a_start_that_does_not_fit_is_refused_whatever_ran_before(
     floating = floating_ring()
     with pytest.raises(srm.InputError, match="unit length"):
         floating.with_state(2.0 * floating.q0, floating.v0)
+
+
+def test_messages_name_late_times_with_all_their_digits() -> None:
+    mechanism = srm.load("slider_crank")
+    with pytest.raises(srm.InputError, match="between 1000000 and t_end = 1000003 s"):
+        srm.simulate(mechanism, 1000003.0, t0=1e6, t_eval=[1000004.0])
+    with pytest.raises(srm.InputError, match="ends at 1000003 s, before it starts at 1000004 s"):
+        srm.simulate(mechanism, 1000003.0, t0=1000004.0)

@@ -133,7 +133,7 @@ returns its result."""
 
 
 @per_model
-def _singular_values(mechanism: MechanismData) -> SingularValues:
+def singular_values(mechanism: MechanismData) -> SingularValues:
     """Singular values of the separated rows of closures and drives."""
     return SingularValues(separated_pattern(mechanism))
 
@@ -152,7 +152,7 @@ class ConstraintMonitor:
         self.rank = analysis.rank
         self.analysis = analysis
         self.dense = dense
-        self._values = _singular_values(self.geometry.mechanism)
+        self._values = singular_values(self.geometry.mechanism)
         self._critical: dict[float, CriticalConfiguration | None] = {}
 
     def states(self, t: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
@@ -557,10 +557,48 @@ def _windows(marked: BoolArray) -> IndexArray:
     return edges.reshape(-1, 2)
 
 
-RecordedDips = tuple[FloatArray, list[list[int]], list[int]]
-"""Times (k,) s of the recorded samples; minima of sigma that may be crossings, in order, as
-indices (n, 3) of samples, the minimum between those on both sides where it is left; and for each
-the index of the largest sigma in its window."""
+@dataclass(frozen=True)
+class Turn:
+    """Where a motion turned back beyond a singular configuration, between two ends of steps.
+
+    Attributes
+    ----------
+    times
+        Of the one end, of the turn and of the other end (s).
+    values
+        The smallest singular value there, with the sign of the part of G that would lose rank:
+        positive at the turn.
+    top
+        Sample with the largest sigma of the window.
+    """
+
+    times: Sequence[float]
+    values: Sequence[float]
+    top: int
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedDips:
+    """Minima of the recorded sigmas that may be crossings, in order.
+
+    Attributes
+    ----------
+    samples : (n, 3)
+        Indices of samples: the minimum between those on both sides where it is left.
+    tops : (n,)
+        Sample with the largest sigma in the window of each.
+    turns
+        Turns beyond singular configurations, which are not among the minima; None before
+        :func:`recorded_turns`.
+    """
+
+    samples: IndexArray
+    tops: IndexArray
+    turns: Sequence[Turn] | None = None
+
+    def at_no_turn(self, others: IndexArray, turns: Sequence[Turn]) -> RecordedDips:
+        """The minima ``others`` (k,), and the ``turns`` found among the rest."""
+        return RecordedDips(self.samples[others], self.tops[others], turns)
 
 
 def recorded_dips(scheme: ButcherTableau, steps: StepData) -> RecordedDips | None:
@@ -582,7 +620,7 @@ def _dips(t: FloatArray, sigma: FloatArray, around: int) -> RecordedDips | None:
     if not len(dips):
         return None
     tops = [a + int(sigma[a : b + 1].argmax()) for a, b in windows[window_of].tolist()]
-    return t, dips.tolist(), tops
+    return RecordedDips(dips, np.array(tops))
 
 
 def _dips_in(
@@ -647,49 +685,40 @@ def _reversals(
     return once[straight], t, monitor.configurations(t)
 
 
-@dataclass(frozen=True)
-class _Turn:
-    """Where a motion turned back next to a singular configuration, between two ends of steps.
-
-    Attributes
-    ----------
-    times
-        Of the one end, of the turn and of the other end (s).
-    values
-        The smallest singular value there, with the sign of the part of G that would lose rank:
-        positive at the turn.
-    """
-
-    times: tuple[float, float, float]
-    values: tuple[float, float, float]
-
-    @property
-    def beyond(self) -> bool:
-        """Whether the motion turned back beyond the singular configuration, not before it."""
-        return self.values[0] < 0.0
-
-
-def _turns(
-    monitor: ConstraintMonitor, scheme: ButcherTableau, steps: StepData, recorded: RecordedDips
-) -> dict[int, _Turn]:
-    """The turns at those of the ``recorded`` minima, by their indices, where all rates change their
-    sign and the motion certainly did not touch the singular configuration."""
+def recorded_turns(
+    monitor: ConstraintMonitor, scheme: ButcherTableau, steps: StepData, dips: RecordedDips
+) -> RecordedDips:
+    """The minima ``dips`` without those at turns, where all rates change their sign and the motion
+    certainly did not touch the singular configuration; and those of the turns that lie beyond it,
+    not before."""
+    every = np.arange(len(dips.tops))
     if monitor.geometry.drives or np.logical_or.reduce(steps.stiff):
-        return {}
-    dips, tops = np.array(recorded[1]), np.array(recorded[2])
+        return dips.at_no_turn(every, ())
     columns = scheme.member(False).distinct
-    stages = len(columns)
-    first, last = np.maximum(dips[:, 0] - 1, 0) // stages, (dips[:, 2] - 1) // stages
+    stages, samples = len(columns), dips.samples
+    # A turn beyond may show as several minima, one next to the other.
+    starts = np.flatnonzero(np.append(True, samples[1:, 0] != samples[:-1, 2]))
+    ends = np.append(starts[1:], len(every)) - 1
+    several = ends > starts
+    lowest, highest = np.append(starts[several], every), np.append(ends[several], every)
+    first, last = (
+        (np.maximum(samples[lowest, 0] - 1, 0)) // stages,
+        (samples[highest, 2] - 1) // stages,
+    )
     # Nothing is read beyond an event that ends the run.
-    alone = steps.times[last + 1] <= steps.end
-    alone[1:] &= dips[:-1, 1] < first[1:] * stages
-    alone[:-1] &= dips[1:, 1] > (last[:-1] + 1) * stages
+    before, after = np.append(-1, samples[:, 1]), np.append(samples[:, 1], np.iinfo(int).max)
+    alone = (
+        (steps.times[last + 1] <= steps.end)
+        & ((lowest == 0) | (before[lowest] < first * stages))
+        & (after[highest + 1] > (last + 1) * stages)
+    )
     own = np.flatnonzero(alone)
     found, t, q = _reversals(monitor, steps, first[own], last[own])
     if not len(found):
-        return {}
+        return dips.at_no_turn(every, ())
     found = own[found]
-    first, last, top = first[found], last[found], np.maximum(tops[found] - 1, 0)
+    lowest, highest, first, last = (values[found] for values in (lowest, highest, first, last))
+    tops = dips.tops[lowest]
     times = np.array((steps.times[first], t, steps.times[last + 1]))
     q_first, q_last = (monitor.analysis.split(steps.states[end])[0] for end in (first, last + 1))
     G = monitor.separated(times.ravel(), np.concatenate((q_first, q, q_last)))
@@ -699,14 +728,23 @@ def _turns(
     values = np.einsum("ni,snij,nj->sn", left[:, :, k], G, right[:, k])
     before, value, after = np.abs(values)
     # The largest value of the window follows from the recorded sigmas.
-    untouched = UNTOUCHED_VALUE * steps.sigmas[top // stages, columns[top % stages]]
+    at = np.maximum(tops - 1, 0)
+    untouched = UNTOUCHED_VALUE * steps.sigmas[at // stages, columns[at % stages]]
     certain = (sizes[:, :k].min(axis=1, initial=np.inf) > VANISHING_TOGETHER * value) & (
         values[0] * values[2] > 0.0
     )
     for side, recorded_side in ((before, steps.sigmas[first, 0]), (after, steps.sigmas[last, -1])):
         certain &= value * recorded_side > untouched * side
-    pairs = zip(found.tolist(), certain.tolist(), zip(*times.tolist()), zip(*values.tolist()))
-    return {i: _Turn(own_times, own) for i, yes, own_times, own in pairs if yes}
+    taken: set[int] = set()
+    turns = []
+    for i in np.flatnonzero(certain).tolist():  # those of several minima first
+        minima = set(range(lowest[i], highest[i] + 1))
+        if minima & taken:
+            continue
+        taken |= minima
+        if values[0, i] < 0.0:
+            turns.append(Turn(times[:, i].tolist(), values[:, i].tolist(), int(tops[i])))
+    return dips.at_no_turn(np.delete(every, list(taken)), turns)
 
 
 def _times_around(
@@ -842,6 +880,7 @@ def find_crossings(
     steps: StepData,
     monitored: Callable[[], tuple[DenseOutput, float]],
     dips_of: Callable[[ButcherTableau, StepData], RecordedDips | None] = recorded_dips,
+    turns_of: Callable[..., RecordedDips] = recorded_turns,
 ) -> tuple[Crossing, ...]:
     """All crossings of a run, in order of time.
 
@@ -850,8 +889,8 @@ def find_crossings(
     monitored
         Returns its dense output, which runs that stay away from singular configurations do not
         need, and the residual (row units) up to which a critical configuration counts as singular.
-    dips_of
-        :func:`recorded_dips` or the kernel's.
+    dips_of, turns_of
+        :func:`recorded_dips` and :func:`recorded_turns`, or the kernel's.
     """
     analysis = system.singularities
     if analysis is None or not steps.count:
@@ -869,14 +908,14 @@ def find_crossings(
     monitor = monitor or ConstraintMonitor(analysis, *monitored())
     searches = []
     if recorded is not None:
-        t, dips, tops = recorded
-        turns = _turns(monitor, scheme, steps, recorded)
-        for i, (dip, top) in enumerate(zip(dips, tops)):
-            turn = turns.get(i)
-            if turn is None:
-                searches.append(_crossings_at(monitor, steps, t, dip, top))
-            elif turn.beyond:
-                searches.append(_crossings_beside(monitor, steps, turn, t[[top]]))
+        if recorded.turns is None:
+            recorded = turns_of(monitor, scheme, steps, recorded)
+        t, _ = _recorded(scheme, steps)
+        searches = [
+            _crossings_at(monitor, steps, t, dip, top)
+            for dip, top in zip(recorded.samples.tolist(), recorded.tops.tolist())
+        ]
+        searches += [_crossings_beside(monitor, steps, t, turn) for turn in recorded.turns or ()]
     found: dict[float, Crossing] = {}
     for crossings in (*monitor.together(searches), _crossings_along_curves(monitor, steps)):
         for crossing in crossings:
@@ -928,14 +967,12 @@ def _crossings_at(
 
 
 def _crossings_beside(
-    monitor: ConstraintMonitor, steps: StepData, turn: _Turn, top: FloatArray
+    monitor: ConstraintMonitor, steps: StepData, t: FloatArray, turn: Turn
 ) -> Search[list[Crossing]]:
-    """The two crossings next to a ``turn`` beyond a singular configuration.
-
-    ``top`` (1,): when sigma of the window is largest (s).
-    """
+    """The two crossings next to a ``turn`` beyond a singular configuration; t (k,) s of the
+    recorded samples."""
     (before, rest, after), (_, value, _) = turn.times, turn.values
-    scale = float((yield top)[0])
+    scale = float((yield t[[turn.top]])[0])
     found = []
     for side, size in ((before, turn.values[0]), (after, turn.values[2])):
         # Next to the turn values are parabolic in time.

@@ -45,7 +45,6 @@ from srm_mbs.integration.singular_passages import (
     Crossing,
     find_bifurcations,
     find_crossings,
-    recorded_dips,
 )
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.lazy import cached_property
@@ -545,14 +544,19 @@ class SimulationResult(RunOutcome):
     def crossings(self) -> tuple[Crossing, ...]:
         """Passages through singular configurations, in order of time."""
         system, scheme = self._system, self.scheme
-        if self._by_kernel and kernel_steps.without_passages(system, scheme, self._dense):
-            return ()
+        searches: tuple[Any, ...] = ()
+        if self._by_kernel:
+            searches = kernel_steps.recorded_dips, kernel_steps.recorded_turns
+            found = kernel_steps.dips_in_records(system, scheme, self._dense)
+            if found == ():
+                return ()
+            if found is not None:
+                searches = (lambda *_: found), kernel_steps.recorded_turns
 
         def monitored() -> tuple[DenseOutput, float]:
             return self._dense, self.settings.singular_tolerance
 
-        dips = kernel_steps.recorded_dips if self._by_kernel else recorded_dips
-        return find_crossings(system, scheme, self.steps, monitored, dips)
+        return find_crossings(system, scheme, self.steps, monitored, *searches)
 
     @cached_property
     def bifurcations(self) -> tuple[Bifurcation, ...]:

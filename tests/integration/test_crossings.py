@@ -18,7 +18,7 @@ from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.integration import singular_passages as crossings_module
 from srm_mbs.integration.kernel import dense_output as kernel_steps
 from srm_mbs.integration.singular_passages import ConstraintMonitor
-from tests.support import reduced
+from tests.support import reduced, turning
 from tests.support.backends import needs_kernel
 from tests.support.bundled import load
 from tests.support.mechanisms import (
@@ -129,9 +129,36 @@ def test_the_kernel_finds_the_same_minima_of_sigma(tableau: str) -> None:
         if expected is None or by_kernel is None:
             assert expected is by_kernel
             continue
-        np.testing.assert_array_equal(by_kernel[0], expected[0])
-        assert by_kernel[1:] == expected[1:]
+        np.testing.assert_array_equal(by_kernel.samples, expected.samples)
+        np.testing.assert_array_equal(by_kernel.tops, expected.tops)
     assert found == {True, False}
+
+
+@needs_kernel
+@pytest.mark.parametrize("tableau", ["dopr54", "dop853"])
+@pytest.mark.parametrize("reach", [1e-4, 1e-5, -1e-4, -1e-2])
+def test_the_kernel_tells_turns_beside_singular_configurations_as_the_reference(
+    reach: float, tableau: str
+) -> None:
+    mechanism = turning.lifted(reach).mechanism
+    solution = srm.simulate(mechanism, 6.0, rtol=1e-7, tableau=tableau)
+    scheme, steps, analysis = solution.scheme, solution.steps, solution.system.singularities
+    dips = crossings_module.recorded_dips(scheme, steps)
+    assert analysis is not None
+    assert dips is not None
+    dense = kernel_steps.dense_output(solution.system, scheme, steps, "kernel")
+    monitor = ConstraintMonitor(analysis, dense)
+    told = dense.turns(scheme, dips)  # type: ignore[attr-defined]
+    expected = crossings_module.recorded_turns(monitor, scheme, steps, dips)
+    assert len(told.samples) < len(dips.samples)
+    np.testing.assert_array_equal(told.samples, expected.samples)
+    np.testing.assert_array_equal(told.tops, expected.tops)
+    assert expected.turns is not None
+    assert bool(expected.turns) == (reach > 0.0)
+    for own, other in zip(told.turns, expected.turns, strict=True):
+        assert own.top == other.top
+        np.testing.assert_allclose(own.times, other.times, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(own.values, other.values, rtol=1e-6)
 
 
 def test_a_start_on_a_singular_configuration_is_no_passage() -> None:

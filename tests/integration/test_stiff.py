@@ -21,7 +21,7 @@ from srm_mbs.integration.methods.tableaus import get_tableau
 from tests.support.commands import run as command
 from tests.support.convergence import fitted_order, observed_order, turning
 from tests.support.mechanisms import floating_ring
-from tests.support.reduced import regular_slider_crank, slider_crank
+from tests.support.reduced import parallelogram, regular_slider_crank, slider_crank
 from tests.support.stiff import (
     braced_four_bar,
     braced_reference,
@@ -32,9 +32,11 @@ from tests.support.stiff import (
     driven_reference,
     follower,
     guided_four_bar,
+    parallelogram_with_disc,
     rubbing,
     rubbing_slider_crank,
 )
+from tests.support.turning import lifted
 
 BACKENDS = ("kernel", "python")
 SLOW_PYTHON = ("kernel", pytest.param("python", marks=pytest.mark.stress))
@@ -510,6 +512,63 @@ def test_kernel_and_reference_make_the_same_steps(name: str, tableau: str) -> No
     times = np.linspace(0.0, float(kernel.t[-1]), 41)
     for read, other in zip(kernel(times), reference(times)):
         np.testing.assert_allclose(read, other, rtol=0.0, atol=2e-4)
+
+
+# Singular configurations
+
+
+@pytest.mark.parametrize("backend", SLOW_PYTHON)
+@pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
+@pytest.mark.parametrize("tau", [1e-4, 1e-6, 1e-8])
+@pytest.mark.parametrize("rate", [5.3, 4.7])
+def test_stiff_motions_pass_singular_configurations_and_turn_back_beside_them(
+    rate: float, tau: float, tableau: str, backend: str
+) -> None:
+    """At 4.7 rad/s at the bottom the parallelogram almost reaches its change points."""
+    mechanism, field, start = parallelogram_with_disc(tau, rate)
+    times = np.linspace(0.0, 2.0, 41)
+    expected = by_radau(field, start, times, rtol=1e-11)
+    for rtol in (1e-4, 1e-6, 1e-8, 1e-9):
+        run = srm.simulate(mechanism, 2.0, rtol=rtol, tableau=tableau, backend=backend)
+        assert run.success, run.message
+        assert run.stats.steps < 400
+        q, _ = run(times)
+        assert np.abs(q[:, 0] - expected[:, 0]).max() < 10.0 * rtol
+        assert np.abs(np.abs(q[:, 3]) - np.abs(expected[:, 1])).max() < rtol
+
+
+@pytest.mark.parametrize("backend", SLOW_PYTHON)
+@pytest.mark.parametrize("reach", [0.3, 0.08, 1e-3, -1e-3, -0.1])
+def test_rodas5p_passes_singular_configurations_as_accurately_as_others(
+    reach: float, backend: str
+) -> None:
+    motion = lifted(reach)
+    passages = len(srm.simulate(motion.mechanism, motion.t_end, rtol=1e-10).crossings)
+    for rtol in (1e-4, 1e-6, 1e-8):
+        run = srm.simulate(
+            motion.mechanism, motion.t_end, rtol=rtol, tableau="rodas5p", backend=backend
+        )
+        assert motion.error(run) < 20.0 * rtol
+        assert run.stats.steps < 400
+        assert len(run.crossings) == passages
+
+
+@pytest.mark.parametrize(
+    ("name", "field"),
+    [("slider_crank_whirl", slider_crank()), ("parallelogram", parallelogram())],
+)
+def test_rodas5p_keeps_order_five_through_singular_configurations(
+    name: str, field: Callable[..., Any]
+) -> None:
+    mechanism, steps, errors = srm.load(name), (0.02, 0.015, 0.01, 0.0075, 0.005), []
+    start = [mechanism.q0[0], mechanism.v0[0]]
+    exact = solve_ivp(field, (0.0, 1.5), start, "DOP853", rtol=3e-14, atol=1e-16).y[:, -1]
+    for h in steps:
+        run = srm.simulate(mechanism, 1.5, tableau="rodas5p", step=h)
+        assert run.success
+        errors.append(max(abs(run.q[-1, 0] - exact[0]), abs(run.v[-1, 0] - exact[1])))
+    assert len(run.crossings) > 0
+    assert fitted_order(steps, errors) > 4.7
 
 
 # Sweeps and the command line

@@ -145,7 +145,7 @@ def test_dense_output_is_as_accurate_as_the_steps() -> None:
     assert chosen.y.shape == (2, 1)
 
 
-@pytest.mark.parametrize("tableau", ["dopr54", "dop853"])
+@pytest.mark.parametrize("tableau", ["dopr54", "dop853", "rodas5p"])
 def test_the_split_form_passes_an_isolated_singularity_of_gb(tableau: str) -> None:
     placements = 0
     for tol in (1e-4, 1e-6, 1e-8, 1e-10):

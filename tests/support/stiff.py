@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
-from tests.support.reduced import OneDegree, regular_slider_crank
+from tests.support.reduced import G, OneDegree, regular_slider_crank
 
 RATE = 5.0
 """Stiffness over damping of the bushing (1/s)."""
@@ -273,6 +273,43 @@ def rubbing_slider_crank(friction: float, start: FloatArray, times: FloatArray) 
         else:
             t = times[-1]
     return np.concatenate(found)
+
+
+DISC = 0.5
+"""Inertia (kg m2) of the disc of :func:`parallelogram_with_disc`."""
+
+
+def parallelogram_with_disc(
+    tau: float, rate: float
+) -> tuple[srm.Mechanism, Callable[[float, FloatArray], Any], FloatArray]:
+    """The parallelogram swings up from below with ``rate`` (rad/s), through its change points; a
+    disc turns on the axis of its rocker, held by a spring whose damper stops it in ``tau`` (s).
+
+    Its equations, of crank angle and disc angle, (8/3 + J) a'' + J p'' = -3 g cos a and
+    J (a'' + p'') = -k p - c p', with c = J / tau and k = 50 c, and their start.
+    """
+    base = srm.load("parallelogram")
+    model = base.model.copy()
+    disc = model.addJoint(
+        model.getJointId("rocker"), pin.JointModelRY(), pin.SE3.Identity(), "disc"
+    )
+    model.appendBodyToJoint(
+        disc, pin.Inertia(1.0, np.zeros(3), DISC * np.eye(3)), pin.SE3.Identity()
+    )
+    model.addBodyFrame("disc", disc, pin.SE3.Identity(), 0)
+    c = DISC / tau
+    spring = srm.TorsionSpring("disc", stiffness=50.0 * c, damping=c)
+    alike = np.array([1.0, -1.0, 1.0, 0.0])
+    mechanism = srm.Mechanism(
+        model, base.loops, q0=-0.5 * np.pi * alike, v0=rate * alike, forces=(spring,)
+    )
+
+    def field(t: float, y: FloatArray) -> Any:
+        torque = -50.0 * c * y[1] - c * y[3]
+        crank = (-3.0 * G * np.cos(y[0]) - torque) / (8.0 / 3.0)
+        return [y[2], y[3], crank, torque / DISC - crank]
+
+    return mechanism, field, np.array([-0.5 * np.pi, 0.0, rate, 0.0])
 
 
 def follower(rate: float) -> tuple[srm.Mechanism, Callable[..., FloatArray]]:

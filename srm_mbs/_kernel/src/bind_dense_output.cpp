@@ -9,10 +9,13 @@
 #include "dense.hpp"
 #include "run_samples.hpp"
 #include "sigma_dips.hpp"
+#include "turns.hpp"
 
 namespace srm {
 
 namespace {
+
+using Indices = nb::ndarray<const long, nb::c_contig, nb::device::cpu>;
 
 #define SRM_PY_STEPS(field)                                                           \
     field(Array, times)             /* (k + 1,) */                                    \
@@ -201,30 +204,70 @@ struct PyDense {
         dense.between_ends(system, t.data(), static_cast<long>(k), within, out.data());
         return owned_array(std::move(out), {k, nx});
     }
+
+    // Of the dips (n, 3) and tops (n,) of dips_of(): numbers of those at no turn, and the turns
+    // beyond singular configurations.
+    nb::tuple turns(nb::handle owner, nb::handle rows_owner, const SeparatedRows& rows,
+                    const TurnSearch& search, const DipSearch& dips, const Indices& samples,
+                    const Indices& tops) {
+        System &system = system_in(owner), &all_rows = system_in(rows_owner);
+        const std::size_t n = tops.size(), count = rows.supports.size();
+        if (samples.ndim() != 2 || samples.shape(0) != n || samples.shape(1) != 3)
+            throw nb::value_error("dips and tops have other shapes");
+        expect_size("rows", count, static_cast<std::size_t>(all_rows.rows()));
+        expect_size("factors", rows.factors.size(), count * system.nv);
+        expect_size("unit", search.unit.size(), static_cast<std::size_t>(system.nv));
+        expect_within("rank", search.rank, 1, std::min<long>(system.nv, static_cast<long>(count)));
+        expect_within("columns", dips.columns, 0, dense.sigma_width() - 1);
+        const long last = dense.steps().count * static_cast<long>(dips.columns.size());
+        SigmaDips recorded;
+        for (std::size_t i = 0; i < n; ++i) {
+            const long* dip = samples.data() + 3 * i;
+            for (const long sample : {dip[0], dip[1], dip[2], tops.data()[i]})
+                expect_within("dips", sample, 0, last);
+            if (dip[2] < 1) throw nb::value_error("a dip ends at the start of the run");
+            recorded.dips.push_back({dip[0], dip[1], dip[2]});
+            recorded.tops.push_back(tops.data()[i]);
+        }
+        const Turns found = recorded_turns(search, rows, all_rows, dips, recorded, dense, system);
+        nb::list beyond;
+        for (const Turn& turn : found.beyond)
+            beyond.append(nb::make_tuple(turn.times, turn.values, turn.top));
+        std::vector<long> others;
+        for (std::size_t i = 0; i < n; ++i)
+            if (!found.found[i]) others.push_back(static_cast<long>(i));
+        return nb::make_tuple(owned_array(std::move(others)), beyond);
+    }
 };
 
-// Times (k,) of the samples of sigma, the dips and their tops; None if there are no dips.
+// The dips (n, 3) and their tops (n,); None if there are none.
+nb::object dips_of(const DipSearch& search, const double* times, const double* sigmas, long steps,
+                   std::size_t width, double end) {
+    expect_within("columns", search.columns, 0, static_cast<long>(width) - 1);
+    SigmaDips found =
+        recorded_dips(search, times, sigmas, steps, static_cast<long>(width), end);
+    const std::size_t n = found.dips.size();
+    if (n == 0) return nb::none();
+    std::vector<long> dips;
+    dips.reserve(3 * n);
+    for (const auto& dip : found.dips) dips.insert(dips.end(), dip.begin(), dip.end());
+    return nb::make_tuple(owned_array(std::move(dips), {n, 3}), owned_array(std::move(found.tops)));
+}
+
 nb::object py_recorded_dips(const DipSearch& search, const Array& times, const Array& sigmas,
                             double end) {
     if (sigmas.ndim() != 2 || sigmas.shape(0) < 1 || times.ndim() != 1 ||
         times.size() != sigmas.shape(0) + 1)
         throw nb::value_error("times and sigmas have other shapes");
-    const long width = static_cast<long>(sigmas.shape(1));
-    expect_within("columns", search.columns, 0, width - 1);
-    SigmaDips found = recorded_dips(search, times.data(), sigmas.data(),
-                                    static_cast<long>(sigmas.shape(0)), width, end);
-    if (found.dips.empty()) return nb::none();
-    return nb::make_tuple(owned_array(std::move(found.t)), found.dips, found.tops);
+    return dips_of(search, times.data(), sigmas.data(), static_cast<long>(sigmas.shape(0)),
+                   sigmas.shape(1), end);
 }
 
-// Whether the plain records of a run have no dips; false for stiff steps.  `stop` as for arrays().
-bool without_dips(const DipSearch& search, const PyRecords& records, std::optional<double> stop) {
+// Those of the plain records of a run without stiff steps.  `stop` as for arrays().
+nb::object dips_of_records(const DipSearch& search, const PyRecords& records,
+                           std::optional<double> stop) {
     const StepArrays steps = arrays(records, stop);
-    if (std::count(steps.stiff.begin(), steps.stiff.end(), 0) != steps.count) return false;
-    const long width = static_cast<long>(records.stages);
-    expect_within("columns", search.columns, 0, width - 1);
-    return recorded_dips(search, steps.times, steps.sigmas, steps.count, width, steps.end)
-        .dips.empty();
+    return dips_of(search, steps.times, steps.sigmas, steps.count, records.stages, steps.end);
 }
 
 // Of each step with sigma (n, abscissae) 1 if its stages lie close to a singular configuration, else 0.
@@ -243,7 +286,7 @@ nb::object py_close_to_singular(const std::vector<double>& abscissae, const Arra
 
 void bind_dense_output(nb::module_& m) {
     m.def("recorded_dips", &py_recorded_dips);
-    m.def("without_dips", &without_dips, nb::arg("search"), nb::arg("records"),
+    m.def("dips_of_records", &dips_of_records, nb::arg("search"), nb::arg("records"),
           nb::arg("stop").none());
     m.def("close_to_singular", &py_close_to_singular);
     bind_struct<PySteps>(m, "StepArrays");
@@ -258,7 +301,8 @@ void bind_dense_output(nb::module_& m) {
         .def("states", &PyDense::states)
         .def("samples", &PyDense::samples)
         .def("works", &PyDense::works)
-        .def("between_ends", &PyDense::between_ends);
+        .def("between_ends", &PyDense::between_ends)
+        .def("turns", &PyDense::turns);
 }
 
 }  // namespace srm

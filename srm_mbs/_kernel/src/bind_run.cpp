@@ -19,6 +19,10 @@ namespace srm {
 
 namespace {
 
+bool any(const std::vector<double>& flags) {
+    return std::any_of(flags.begin(), flags.end(), [](double flag) { return flag != 0.0; });
+}
+
 // A view of `values`, which `owner` keeps alive.
 template <typename Values>
 nb::object view(const Values& values, std::initializer_list<std::size_t> shape, nb::handle owner) {
@@ -406,10 +410,6 @@ struct PyRun {
         return guard ? guard->suspect_times : std::vector<double>{};
     }
 };
-
-bool any(const std::vector<double>& flags) {
-    return std::any_of(flags.begin(), flags.end(), [](double flag) { return flag != 0.0; });
-}
 
 }  // namespace
 

@@ -89,6 +89,8 @@ public:
     bool has_stages(long step) const;
     // Whether a step takes further stages to be read.
     bool takes_stages() const { return schemes_[0].extension.extra_stages() > 0; }
+    // Numbers of sigma in each step.
+    long sigma_width() const { return static_cast<long>(schemes_[0].abscissae.size()); }
 
     static constexpr int most_nodes = 16;  // of a polynomial
 

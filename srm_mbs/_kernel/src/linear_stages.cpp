@@ -54,12 +54,14 @@ LinearStages::LinearStages(System& system, double gamma, std::vector<double> uni
 void LinearStages::prepare(double t, double h, const double* state,
                            const std::vector<double>& rate,
                            const std::vector<double>& state_scale,
-                           const std::vector<double>& laws, const System::ZoneView& zone) {
-    const bool same = known_ && known_time_ == t && known_rate_ == rate && known_laws_ == laws &&
+                           const std::vector<double>& laws, const System::ZoneView& zone,
+                           bool on_branch) {
+    const bool same = known_ && known_time_ == t && on_branch_ == on_branch &&
+                      known_rate_ == rate && known_laws_ == laws &&
                       std::equal(known_state_.begin(), known_state_.end(), state);
     if (!same) {
         known_ = false;
-        linearise(t, h, state, state_scale, laws, zone);
+        linearise(t, h, state, state_scale, laws, zone, on_branch);
         known_time_ = t;
         known_rate_ = rate;
         known_laws_ = laws;
@@ -71,8 +73,10 @@ void LinearStages::prepare(double t, double h, const double* state,
 
 void LinearStages::linearise(double t, double h, const double* state,
                              const std::vector<double>& state_scale,
-                             const std::vector<double>& laws, const System::ZoneView& zone) {
+                             const std::vector<double>& laws, const System::ZoneView& zone,
+                             bool on_branch) {
     const int nv = nv_, n = n_, m = count_;
+    on_branch_ = on_branch;
     if (!laws.empty()) expect_size("laws", laws.size(), static_cast<std::size_t>(m));
     // The rate of the memory is the one before the last correction, which stiff forces notice.
     system_.apply_laws(laws.empty() ? nullptr : laws.data());
@@ -84,7 +88,11 @@ void LinearStages::linearise(double t, double h, const double* state,
     for (int j = 0; j < n; ++j)
         steps[j] = rounded_down(constants_.difference * std::max(unit_[j], state_scale[j]));
     std::fill(delta_.begin(), delta_.end(), 0.0);
-    if (system_.linearise(t, state, &rate_[nv], steps, C_.data(), D_.data(), W_.data(),
+    whole_ = on_branch && !system_.rank_deficient();
+    if (whole_) {
+        system_.law_accelerations(W_.data());
+        along_branch(t, state, steps, zone);
+    } else if (system_.linearise(t, state, &rate_[nv], steps, C_.data(), D_.data(), W_.data(),
                           L_.data())) {
         chart_by_coordinates(steps);
     } else {
@@ -95,7 +103,9 @@ void LinearStages::linearise(double t, double h, const double* state,
             by_differences(t, state, steps, zone);
     }
     for (int j = 0; j < n; ++j) {
-        double* const column = j < nv ? &C_[j * nv] : &D_[(j - nv) * nv];
+        double* const column = whole_   ? &J_[j * n + nv]
+                               : j < nv ? &C_[j * nv]
+                                        : &D_[(j - nv) * nv];
         for (int k = 0; k < m; ++k)
             if (L_[j * m + k] != 0.0) add(L_[j * m + k], &W_[k * nv], column, nv);
     }
@@ -113,6 +123,12 @@ void LinearStages::linearise(double t, double h, const double* state,
 void LinearStages::rate_at(double t, const double* state, const System::ZoneView& zone,
                            std::vector<double>& out) {
     system_.evaluate(t, state, zone);
+    if (on_branch_ && !system_.rank_deficient()) {
+        system_.correction(work_.data());
+        for (double& x : work_) x = -x;
+        system_.retract(state, work_.data(), x_.data());
+        system_.evaluate(t, x_.data(), zone);
+    }
     system_.rate(out.data());
 }
 
@@ -133,6 +149,34 @@ void LinearStages::by_differences(double t, const double* state, const std::vect
         for (int i = 0; i < nv; ++i) column[i] = (probe_[nv + i] - rate_[nv + i]) / step;
         for (int k = 0; k < m; ++k) L_[j * m + k] = (system_.law_values()[k] - laws_[k]) / step;
         delta_[j] = 0.0;
+    }
+}
+
+// J with the laws held, and L, along the branch: off it the rates are those of its nearest place, and
+// their derivatives along the normals are zero.
+void LinearStages::along_branch(double t, const double* state, const std::vector<double>& steps,
+                                const System::ZoneView& zone) {
+    const int nv = nv_, n = n_, m = count_;
+    J_.resize(static_cast<std::size_t>(n) * n);
+    std::vector<double> tangents(static_cast<std::size_t>(nv) * nv, 0.0), normal(nv);
+    for (int j = 0; j < nv; ++j) {
+        double* const tangent = &tangents[static_cast<std::size_t>(j) * nv];
+        tangent[j] = 1.0;
+        system_.normal_part(tangent, normal.data());
+        add(-1.0, normal.data(), tangent, nv);
+    }
+    std::vector<double> delta(n), moved(x_.size());
+    for (int j = 0; j < n; ++j) {
+        const int first = j < nv ? 0 : nv;
+        std::fill(delta.begin(), delta.end(), 0.0);
+        add(steps[j], &tangents[static_cast<std::size_t>(j - first) * nv], &delta[first], nv);
+        system_.retract(state, delta.data(), moved.data());
+        rate_at(t, moved.data(), zone, probe_);
+        system_.chart_rate(delta.data(), probe_.data(), other_.data());
+        double* const column = &J_[static_cast<std::size_t>(j) * n];
+        for (int i = 0; i < n; ++i)
+            column[i] = ((i < nv ? other_[i] : probe_[i]) - rate_[i]) / steps[j];
+        for (int k = 0; k < m; ++k) L_[j * m + k] = (system_.law_values()[k] - laws_[k]) / steps[j];
     }
 }
 
@@ -186,6 +230,18 @@ void LinearStages::chart_by_coordinates(const std::vector<double>& steps) {
 void LinearStages::factorise(double k) {
     const int nv = nv_;
     k_ = k;
+    if (whole_) {
+        const int n = n_;
+        factors_.resize(J_.size());
+        pivots_.resize(n);
+        for (int j = 0; j < n; ++j) {
+            for (int i = 0; i < n; ++i) factors_[j * n + i] = -k * J_[j * n + i];
+            factors_[j * n + j] += 1.0;
+        }
+        if (!lu_factor(factors_.data(), n, pivots_.data()))
+            throw EvaluationError{Failure::acceleration};
+        return;
+    }
     CS_ = C_;
     for (const GroupJoint& joint : system_.groups()) {
         // The inverse of one block, and its product with the columns of C.
@@ -222,15 +278,19 @@ void LinearStages::solve(double* x, const double* laws, const double* applied,
     const int nv = nv_, m = count_;
     double* const y = x + nv;
     for (int k = 0; k < m; ++k) add(laws[k] - applied[k], &W_[k * nv], y, nv);
-    for (int j = 0; j < nv; ++j)
-        if (x[j] != 0.0) add(k_ * x[j], &CS_[j * nv], y, nv);
-    lu_solve(factors_.data(), nv, pivots_.data(), y);
-    for (int i = 0; i < nv; ++i) x[i] += k_ * y[i];
-    for (const GroupJoint& joint : system_.groups()) {
-        double out[6] = {};
-        for (int j = 0; j < joint.size; ++j)
-            add(x[joint.start + j], &S_[(joint.start + j) * nv + joint.start], out, joint.size);
-        std::copy_n(out, joint.size, x + joint.start);
+    if (whole_) {
+        lu_solve(factors_.data(), n_, pivots_.data(), x);
+    } else {
+        for (int j = 0; j < nv; ++j)
+            if (x[j] != 0.0) add(k_ * x[j], &CS_[j * nv], y, nv);
+        lu_solve(factors_.data(), nv, pivots_.data(), y);
+        for (int i = 0; i < nv; ++i) x[i] += k_ * y[i];
+        for (const GroupJoint& joint : system_.groups()) {
+            double out[6] = {};
+            for (int j = 0; j < joint.size; ++j)
+                add(x[joint.start + j], &S_[(joint.start + j) * nv + joint.start], out, joint.size);
+            std::copy_n(out, joint.size, x + joint.start);
+        }
     }
     for (int k = 0; k < m; ++k) law_rates[k] = (laws[k] - applied[k]) / k_;
     for (int j = 0; j < n_; ++j) add(x[j], &L_[j * m], law_rates, m);
@@ -238,6 +298,11 @@ void LinearStages::solve(double* x, const double* laws, const double* applied,
 
 void LinearStages::multiply(const std::vector<double>& x, std::vector<double>& out) const {
     const int nv = nv_;
+    if (whole_) {
+        std::fill(out.begin(), out.end(), 0.0);
+        for (int j = 0; j < n_; ++j) add(x[j], &J_[j * n_], out.data(), n_);
+        return;
+    }
     for (int i = 0; i < nv; ++i) {
         out[i] = x[nv + i];
         out[nv + i] = 0.0;

@@ -13,7 +13,8 @@ namespace srm {
 //
 //     x = S (a + k y),   (1 - k D - k^2 C S) y = b + k C S a,   S = (1 - k B)^-1,
 //
-// S the identity but for ball, free and planar joints: nv equations, not 2 nv.
+// S the identity but for ball, free and planar joints: nv equations, not 2 nv.  Next to a singular
+// configuration, where stages are evaluated on their branch, J has no such blocks.
 class LinearStages {
 public:
     LinearStages(System& system, double gamma, std::vector<double> unit,
@@ -21,10 +22,10 @@ public:
 
     // Linearises the system at the start of a step, unless that was done for the step before, and
     // factorises for the step h.  `rate`, `state_scale` (n,), `laws` (m,), or empty: as they are in
-    // the memory.
+    // the memory.  on_branch: whether the stages are evaluated on their branch.
     void prepare(double t, double h, const double* state, const std::vector<double>& rate,
                  const std::vector<double>& state_scale, const std::vector<double>& laws,
-                 const System::ZoneView& zone);
+                 const System::ZoneView& zone, bool on_branch);
     // For a stage with the chart rates x (n,), evaluated with the laws `applied` (m,), where they
     // are `laws`: x = (1 - h gamma J)^-1 (x + (0, W (laws - applied))), and the rates of the laws.
     void solve(double* x, const double* laws, const double* applied, double* law_rates);
@@ -37,7 +38,7 @@ public:
     void linearise_anew(double t, double h, const double* state,
                         const std::vector<double>& state_scale) {
         known_ = false;
-        linearise(t, h, state, state_scale, {}, {});
+        linearise(t, h, state, state_scale, {}, {}, false);
     }
     // J (n, n), column by column, at the start; the laws by the chart coordinates (m, n), and the
     // accelerations by the laws (nv, m), alike.
@@ -50,13 +51,15 @@ public:
 private:
     void linearise(double t, double h, const double* state,
                    const std::vector<double>& state_scale, const std::vector<double>& laws,
-                   const System::ZoneView& zone);
+                   const System::ZoneView& zone, bool on_branch);
     void rate_at(double t, const double* state, const System::ZoneView& zone,
                  std::vector<double>& out);
     void by_differences(double t, const double* state, const std::vector<double>& steps,
                         const System::ZoneView& zone);
     void chart_by_coordinates(const std::vector<double>& steps);
     void by_forces(double t, const double* state, const std::vector<double>& steps);
+    void along_branch(double t, const double* state, const std::vector<double>& steps,
+                      const System::ZoneView& zone);
     void factorise(double k);
     void multiply(const std::vector<double>& x, std::vector<double>& out) const;  // J x
 
@@ -65,7 +68,7 @@ private:
     const double gamma_;
     const std::vector<double> unit_;
     const Constants& constants_;
-    bool known_ = false;
+    bool known_ = false, on_branch_ = false, whole_ = false;  // whole_: J is J_
     double known_time_ = 0.0, k_ = 0.0;
     std::vector<double> known_state_, known_rate_, known_laws_;
     std::vector<double> rate_, by_time_, applied_, laws_;
@@ -74,6 +77,7 @@ private:
     std::vector<double> W_;               // (nv, m), of the accelerations by the laws
     std::vector<double> S_;               // (nv, nv), the blocks of joints that need a chart
     std::vector<double> CS_, factors_;    // (nv, nv)
+    std::vector<double> J_;               // (n, n), column by column, on the branch
     std::vector<int> pivots_;
     std::vector<double> x_, delta_, probe_, other_, work_;
 };

@@ -12,6 +12,7 @@
 #include "run_samples.hpp"
 #include "separated_rows.hpp"
 #include "sigma_dips.hpp"
+#include "turns.hpp"
 
 using namespace srm;
 
@@ -47,6 +48,7 @@ void bind_structs(nb::module_& m) {
     bind_struct<DenseConstants>(m, "DenseConstants");
     bind_struct<SampleRules>(m, "SampleRules");
     bind_struct<DipSearch>(m, "DipSearch");
+    bind_struct<TurnSearch>(m, "TurnSearch");
     bind_struct<EventConstants>(m, "EventConstants");
     bind_struct<BranchCurve>(m, "BranchCurve");
 }

@@ -23,8 +23,8 @@ void SeparatedRows::check() const {
         expect_within("active", active[j], active[j - 1] + 1, last);
 }
 
-double SeparatedRows::smallest(System& system, Algebra& algebra, double t, const double* q,
-                               std::vector<double>& G) const {
+void SeparatedRows::write(System& system, double t, const double* q,
+                          std::vector<double>& G) const {
     const std::size_t rows = supports.size(), n = factors.size() / rows;
     // Entries in which only another row may have a share are not written.
     for (const int row : share_rows)
@@ -37,13 +37,21 @@ double SeparatedRows::smallest(System& system, Algebra& algebra, double t, const
         const double* const other = &G[share_others[s] * n];
         for (const int k : supports[share_rows[s]]) own[k] -= shares[s] * other[k];
     }
+    for (std::size_t row = 0; row < rows; ++row)
+        for (const int k : supports[row]) G[row * n + k] /= left[row];
+}
+
+double SeparatedRows::smallest(System& system, Algebra& algebra, double t, const double* q,
+                               std::vector<double>& G) const {
+    const std::size_t rows = supports.size(), n = factors.size() / rows;
+    write(system, t, q, G);
     std::size_t next = 0;
     for (std::size_t row = 0; row < rows; ++row) {
         const bool used = next < active.size() && active[next] == static_cast<int>(row);
         double* const out = used ? algebra.row(static_cast<int>(next)) : nullptr;
         double squares = 0.0;
         for (const int k : supports[row]) {
-            const double value = G[row * n + k] / left[row];
+            const double value = G[row * n + k];
             squares += value * value;
             if (used) out[k] = value;
         }

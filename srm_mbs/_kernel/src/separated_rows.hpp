@@ -24,8 +24,10 @@ struct SeparatedRows {
     SRM_FIELDS(SRM_SEPARATED_ROWS)
 
     void check() const;
+    // The rows G (rows, n), zero at first, of `system` at q and t.
+    void write(System& system, double t, const double* q, std::vector<double>& G) const;
     // The smallest singular value of the active rows of `system` at q and t, with `algebra` for
-    // these; NaN where other rows are not zero.  G: (rows, n), zero at first.
+    // these; NaN where other rows are not zero.  G as for write().
     double smallest(System& system, Algebra& algebra, double t, const double* q,
                     std::vector<double>& G) const;
 };

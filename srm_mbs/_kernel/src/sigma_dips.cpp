@@ -27,40 +27,124 @@ std::vector<double> largest_around(const std::vector<double>& values, int before
     return out;
 }
 
-// Whether no interval between samples can be marked: in each step the lowest sigma, less the change
-// that the steepest slope of the steps around allows in its longest interval, bounds all of them.
-bool stays_away(const DipSearch& search, const double* times, const double* sigmas, long steps,
-                long width) {
-    const std::size_t stages = search.columns.size();
-    std::vector<double> lengths(stages);
-    for (std::size_t j = 0; j < stages; ++j)
-        lengths[j] = search.abscissae[j] - (j ? search.abscissae[j - 1] : 0.0);
-    const double longest = *std::max_element(lengths.begin(), lengths.end());
-    for (double& length : lengths) length = 1.0 / length;
-    std::vector<double> slopes(steps), lowest(steps);
-    double largest = sigmas[0], before = sigmas[0];
-    for (long i = 0; i < steps; ++i) {
-        double low = before, slope = 0.0;
-        for (std::size_t j = 0; j < stages; ++j) {
-            const double value = sigmas[i * width + search.columns[j]];
-            slope = std::max(slope, std::abs(value - before) * lengths[j]);
-            low = std::min(low, value);
-            largest = std::max(largest, value);
-            before = value;
+// The recorded sigmas of the steps of a run.
+class Recorded {
+public:
+    Recorded(const DipSearch& search, const double* times, const double* sigmas, long steps,
+             long width)
+        : search_(search), times_(times), sigmas_(sigmas), steps_(steps), width_(width) {
+        for (std::size_t j = 0; j < search.columns.size(); ++j)
+            lengths_.push_back(search.abscissae[j] - (j ? search.abscissae[j - 1] : 0.0));
+        for (const double length : lengths_) inverse_.push_back(1.0 / length);
+    }
+
+    // Of each step whether sigma may come close to zero in one of its intervals: unless its lowest
+    // sigma, less the change that the steepest slope of the steps around allows in the longest
+    // interval, is far from that.  False if none may.
+    bool bound() {
+        const std::size_t stages = lengths_.size();
+        std::vector<double> slopes(steps_), lowest(steps_);
+        double largest = sigmas_[0], before = sigmas_[0];
+        const int* const columns = search_.columns.data();
+        const double *const inverse = inverse_.data(), *own = sigmas_;
+        for (long i = 0; i < steps_; ++i, own += width_) {
+            double low = before, high = before, slope = 0.0;
+            for (std::size_t j = 0; j < stages; ++j) {
+                const double value = own[columns[j]];
+                slope = std::max(slope, std::abs(value - before) * inverse[j]);
+                low = std::min(low, value);
+                high = std::max(high, value);
+                before = value;
+            }
+            largest = std::max(largest, high);
+            lowest[i] = low;
+            slopes[i] = slope / length(i);
         }
-        if (!(low >= search.lingering)) return false;
-        lowest[i] = low;
-        slopes[i] = slope / (times[i + 1] - times[i]);
+        const int reach = (search_.around + static_cast<int>(stages) - 1) / static_cast<int>(stages);
+        slopes_ = largest_around(slopes, reach, reach);
+        level_ = search_.vanishing * largest;
+        const double longest = *std::max_element(lengths_.begin(), lengths_.end());
+        near_.resize(steps_);
+        bool any = false;
+        for (long i = 0; i < steps_; ++i) {
+            const double change = longest * length(i) * slopes_[i];
+            near_[i] = !(lowest[i] >= search_.lingering &&
+                         lowest[i] - 0.5 * search_.slope_margin * change >= level_);
+            any |= near_[i];
+        }
+        return any;
     }
-    const int reach = (search.around + static_cast<int>(stages) - 1) / static_cast<int>(stages);
-    slopes = largest_around(slopes, reach, reach);
-    for (long i = 0; i < steps; ++i) {
-        const double change = longest * (times[i + 1] - times[i]) * slopes[i];
-        if (!(lowest[i] - 0.5 * search.slope_margin * change >= search.vanishing * largest))
-            return false;
+
+    // The sigmas as one vector of samples, up to `end` (s).
+    const std::vector<double>& take_samples(double end) {
+        sigma_.resize(steps_ * lengths_.size() + 1);
+        sigma_[0] = sigmas_[0];
+        double* next = &sigma_[1];
+        for (long i = 0; i < steps_; ++i)
+            for (const int column : search_.columns) *next++ = sigmas_[i * width_ + column];
+        while (!sigma_.empty() && time(sigma_.size() - 1) > end) sigma_.pop_back();
+        return sigma_;
     }
-    return true;
-}
+
+    // Between which neighbouring samples sigma may have come close to zero.
+    std::vector<char> marked() const {
+        const std::size_t intervals = sigma_.size() - 1, stages = lengths_.size();
+        std::vector<char> out(intervals);
+        for (long step = 0; step < steps_; ++step) {
+            if (!near_[step]) continue;
+            const std::size_t last = std::min((step + 1) * stages, intervals);
+            for (std::size_t i = step * stages; i < last; ++i)
+                out[i] = std::min(sigma_[i], sigma_[i + 1]) < search_.lingering ||
+                         (lowest(i, slopes_[step]) < level_ &&
+                          lowest(i) < search_.vanishing * largest_beside(i));
+        }
+        return out;
+    }
+
+    // The lowest sigma between samples i and i + 1 that the slopes around them allow.
+    double lowest(std::size_t i) const {
+        const std::size_t around = search_.around, last = std::min(i + around, sigma_.size() - 2);
+        double steepest = 0.0;
+        for (std::size_t k = i > around ? i - around : 0; k <= last;) {
+            const std::size_t step = k / lengths_.size();
+            const std::size_t next = std::min((step + 1) * lengths_.size(), last + 1);
+            double slope = 0.0;
+            for (std::size_t j = k % lengths_.size(); k < next; ++j, ++k)
+                slope = std::max(slope, std::abs(sigma_[k + 1] - sigma_[k]) * inverse_[j]);
+            steepest = std::max(steepest, slope / length(static_cast<long>(step)));
+        }
+        return lowest(i, steepest);
+    }
+
+private:
+    double length(long step) const { return times_[step + 1] - times_[step]; }
+    double time(std::size_t i) const {
+        if (i == 0) return times_[0];
+        const std::size_t step = (i - 1) / lengths_.size();
+        const double part = search_.abscissae[(i - 1) % lengths_.size()];
+        return times_[step] + part * length(static_cast<long>(step));
+    }
+    double lowest(std::size_t i, double steepest) const {
+        const long step = static_cast<long>(i / lengths_.size());
+        const double interval = lengths_[i % lengths_.size()] * length(step);
+        return 0.5 * (sigma_[i] + sigma_[i + 1] - search_.slope_margin * steepest * interval);
+    }
+    double largest_beside(std::size_t i) const {
+        const std::size_t around = search_.around;
+        const std::size_t last = std::min(i + around + 1, sigma_.size() - 1);
+        const auto first = sigma_.begin() + (i > around ? i - around : 0);
+        return *std::max_element(first, sigma_.begin() + last + 1);
+    }
+
+    const DipSearch& search_;
+    const double *times_, *sigmas_;
+    const long steps_, width_;
+    std::vector<double> lengths_, inverse_;  // of the intervals, over the step
+    std::vector<double> slopes_;             // (steps,), the steepest around each step
+    std::vector<char> near_;                 // (steps,)
+    double level_ = 0.0;                     // sigma that vanishes beside the largest of all
+    std::vector<double> sigma_;
+};
 
 }  // namespace
 
@@ -73,48 +157,21 @@ void DipSearch::check() const {
 SigmaDips recorded_dips(const DipSearch& search, const double* times, const double* sigmas,
                         long steps, long width, double end) {
     SigmaDips found;
-    if (stays_away(search, times, sigmas, steps, width)) return found;
-    const std::size_t stages = search.columns.size();
-    std::vector<double>& t = found.t;
-    std::vector<double> sigma;
-    t.reserve(steps * stages + 1);
-    sigma.reserve(steps * stages + 1);
-    const auto add_sample = [&](double time, double value) {
-        if (time > end) return;
-        t.push_back(time);
-        sigma.push_back(value);
-    };
-    add_sample(times[0], sigmas[0]);
-    for (long i = 0; i < steps; ++i) {
-        const double h = times[i + 1] - times[i];
-        for (std::size_t j = 0; j < stages; ++j)
-            add_sample(times[i] + search.abscissae[j] * h, sigmas[i * width + search.columns[j]]);
-    }
-    const std::size_t n = t.size();
+    Recorded recorded(search, times, sigmas, steps, width);
+    if (!recorded.bound()) return found;
+    const std::vector<double>& sigma = recorded.take_samples(end);
+    const std::size_t n = sigma.size();
     if (n < 3 || !finite(sigma.data(), static_cast<int>(n))) return found;
-    // Between neighbouring samples: the lowest sigma that the slopes around allow.
-    std::vector<double> lowest(n - 1);
-    for (std::size_t i = 0; i + 1 < n; ++i)
-        lowest[i] = std::abs(sigma[i + 1] - sigma[i]) / (t[i + 1] - t[i]);
-    lowest = largest_around(lowest, search.around, search.around);
-    const std::vector<double> size = largest_around(sigma, search.around, search.around + 1);
-    std::vector<char> marked(n - 1);
-    bool any = false;
-    for (std::size_t i = 0; i + 1 < n; ++i) {
-        lowest[i] = 0.5 * (sigma[i] + sigma[i + 1] -
-                           search.slope_margin * lowest[i] * (t[i + 1] - t[i]));
-        marked[i] = lowest[i] < search.vanishing * size[i] ||
-                    std::min(sigma[i], sigma[i + 1]) < search.lingering;
-        any |= marked[i];
-    }
-    if (!any) return found;
+    const std::vector<char> marked = recorded.marked();
     const auto in_window = [&](std::size_t i) {  // marked itself, or next to one that is
         return i + 1 < n && (marked[i] || (i > 0 && marked[i - 1]) || (i + 2 < n && marked[i + 1]));
     };
-    for (std::size_t begin = 0; begin + 1 < n; ++begin) {
-        if (!in_window(begin)) continue;
-        std::size_t last = begin;  // the last sample of the window
-        while (in_window(last)) ++last;
+    for (auto next = marked.begin();
+         (next = std::find(next, marked.end(), 1)) != marked.end();) {
+        std::size_t last = next - marked.begin();
+        const std::size_t begin = last > 0 ? last - 1 : 0;
+        while (in_window(last)) ++last;  // the last sample of the window
+        next = marked.begin() + std::min(last, n - 1);
         const auto top = std::max_element(sigma.begin() + begin, sigma.begin() + last + 1);
         const double level = std::max(search.departed * *top, search.least_departed);
         for (std::size_t k = begin; k <= last; ++k) {
@@ -123,20 +180,19 @@ SigmaDips recorded_dips(const DipSearch& search, const double* times, const doub
             std::size_t left = k > begin ? k - 1 : k, right = k < last ? k + 1 : k;
             while (left > begin && sigma[left] < level) --left;
             while (right < last && sigma[right] < level) ++right;
-            const double floor = std::min(k > begin ? lowest[k - 1] : infinity,
-                                          k < last ? lowest[k] : infinity);
+            const double floor = std::min(k > begin ? recorded.lowest(k - 1) : infinity,
+                                          k < last ? recorded.lowest(k) : infinity);
             if (!(floor < search.depth * std::min(sigma[left], sigma[right]))) continue;
-            const std::vector<int> dip{static_cast<int>(left), static_cast<int>(k),
-                                       static_cast<int>(right)};
+            const std::array<long, 3> dip{static_cast<long>(left), static_cast<long>(k),
+                                          static_cast<long>(right)};
             // Of small minima between the same sides, the smallest.
             if (!found.dips.empty() && found.dips.back()[0] == dip[0]) {
                 if (sigma[k] < sigma[found.dips.back()[1]]) found.dips.back() = dip;
                 continue;
             }
             found.dips.push_back(dip);
-            found.tops.push_back(static_cast<int>(top - sigma.begin()));
+            found.tops.push_back(top - sigma.begin());
         }
-        begin = last;
     }
     return found;
 }

@@ -2,6 +2,7 @@
 // integration/singular_passages.py.
 #pragma once
 
+#include <array>
 #include <vector>
 
 #include "struct_fields.hpp"
@@ -26,12 +27,12 @@ struct DipSearch {
 };
 
 struct SigmaDips {
-    std::vector<double> t;              // of all samples
-    std::vector<std::vector<int>> dips; // the minimum between those on both sides where it is left
-    std::vector<int> tops;              // the largest sample of the window of each
+    std::vector<std::array<long, 3>> dips;  // the minimum between those on both sides where it is left
+    std::vector<long> tops;                 // the largest sample of the window of each
 };
 
-// times (steps + 1,), sigmas (steps, width); samples after `end` are left out.
+// times (steps + 1,), sigmas (steps, width).  Samples: the start, then the columns of each step, up
+// to `end`.
 SigmaDips recorded_dips(const DipSearch& search, const double* times, const double* sigmas,
                         long steps, long width, double end);
 

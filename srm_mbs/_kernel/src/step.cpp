@@ -477,7 +477,7 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
     const Tracking tracking(linear_ ? &system_ : nullptr);
     if (linear_) {
         linear_->prepare(t, h_, state, memory.rate, memory.state_scale, memory.laws,
-                         monitored_ ? branch_.zone : none);
+                         monitored_ ? branch_.zone : none, monitored_ && branch_.near);
         for (int j = 0; j <= scheme.lead; ++j) {
             std::copy_n(linear_->rate().begin(), n, &r.rates[j * n]);
             r.sigmas[j] = memory.sigma;

@@ -21,15 +21,16 @@ namespace nb = nanobind;
 using Array = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 
 // A NumPy array that owns `values`.
-inline nb::object owned_array(std::vector<double> values,
-                              std::initializer_list<std::size_t> shape) {
-    auto* kept = new std::vector<double>(std::move(values));
-    nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<double>*>(p); });
+template <class Number = double>
+nb::object owned_array(std::vector<Number> values, std::initializer_list<std::size_t> shape) {
+    auto* kept = new std::vector<Number>(std::move(values));
+    nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<Number>*>(p); });
     return nb::cast(
-        nb::ndarray<nb::numpy, double>(kept->data(), shape.size(), shape.begin(), owner));
+        nb::ndarray<nb::numpy, Number>(kept->data(), shape.size(), shape.begin(), owner));
 }
 
-inline nb::object owned_array(std::vector<double> values) {
+template <class Number = double>
+nb::object owned_array(std::vector<Number> values) {
     const std::size_t size = values.size();
     return owned_array(std::move(values), {size});
 }

@@ -10,19 +10,22 @@ import numpy as np
 
 from srm_mbs._kernel import core
 from srm_mbs._typing import BoolArray, FloatArray
-from srm_mbs.dynamics.constraints.structure import SMALL_REFERENCE_PIVOT
+from srm_mbs.dynamics.constraints.geometry import geometry_of
+from srm_mbs.dynamics.constraints.row_algebra import COMPILED_ABOVE
+from srm_mbs.dynamics.constraints.structure import SMALL_REFERENCE_PIVOT, structure_of
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.integration import singular_passages
 from srm_mbs.integration.dense_output import DenseOutput, StepData
 from srm_mbs.integration.generated.code import code_of_record
 from srm_mbs.integration.kernel import marshalling
 from srm_mbs.integration.kernel.backend import COMPILED
-from srm_mbs.integration.kernel.observables import CompiledObservables
+from srm_mbs.integration.kernel.observables import CompiledObservables, separated_rows
 from srm_mbs.integration.kernel.system import make_kernel_system, shared, workspace
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.run_samples import RunSamples
-from srm_mbs.integration.singular_passages import RecordedDips
+from srm_mbs.integration.singular_passages import ConstraintMonitor, RecordedDips, Turn
 from srm_mbs.model.lazy import cached_property
+from srm_mbs.model.mechanism import MechanismData, per_start
 
 
 def dense_output(
@@ -90,7 +93,7 @@ class CompiledDenseOutput(DenseOutput):
         if self._by_reference:
             return super().__call__(t)
         try:
-            return self._read("states", _as_array(t))  # type: ignore[no-any-return]
+            return self._read(t)
         except ArithmeticError:
             return super().__call__(t)  # raises the error that says why
         except IndexError:
@@ -103,9 +106,11 @@ class CompiledDenseOutput(DenseOutput):
         if self._by_reference:
             return None
         try:
-            return RunSamples(*self._read("samples", marshalling.sample_rules(), unit))
+            read, rules = self._compiled.samples, marshalling.sample_rules()
+            found = self._evaluated(lambda kernel_system: read(kernel_system, rules, unit))
         except ArithmeticError:
             return None
+        return RunSamples(*found)
 
     def element_works(
         self, observables: CompiledObservables, t: FloatArray
@@ -122,28 +127,49 @@ class CompiledDenseOutput(DenseOutput):
         if self._by_reference:
             return super().between_ends(t, allowed)
         try:
-            return self._read("between_ends", _as_array(t), allowed)  # type: ignore[no-any-return]
+            return self._read(t, allowed)
         except ArithmeticError:
             return super().between_ends(t, allowed)  # raises the error that says why
         except IndexError:
             self.check(t)  # raises
             raise
 
-    def _read(self, what: str, *arguments: Any) -> Any:
+    def _read(self, t: FloatArray, *allowed: FloatArray) -> FloatArray:
+        times = np.ascontiguousarray(t, dtype=float)
+        read = self._compiled.between_ends if allowed else self._compiled.states
+        return self._evaluated(lambda kernel_system: read(kernel_system, times, *allowed))  # type: ignore[no-any-return]
+
+    def _evaluated(self, read: Callable[[Any], Any]) -> Any:
+        """``read`` of a kernel system of the mechanism, whose work is counted."""
         if self.kernel_system is not None:
-            return self._read_by(self.kernel_system, what, *arguments)
+            return self._counted(self.kernel_system, read)
         code = code_of_record(self._made_by, self._mechanism_system.mechanism)
         with workspace(self._mechanism_system, code) as kernel_system:
-            return self._read_by(kernel_system, what, *arguments)
+            return self._counted(kernel_system, read)
 
-    def _read_by(self, kernel_system: Any, what: str, *arguments: Any) -> Any:
+    def _counted(self, kernel_system: Any, read: Callable[[Any], Any]) -> Any:
         before = kernel_system.evaluations, kernel_system.factorisations
         try:
-            return getattr(self._compiled, what)(kernel_system, *arguments)
+            return read(kernel_system)
         finally:
             self._mechanism_system.count(
                 kernel_system.evaluations - before[0], kernel_system.factorisations - before[1]
             )
+
+    def turns(self, scheme: ButcherTableau, dips: RecordedDips) -> RecordedDips | None:
+        """:func:`~srm_mbs.integration.singular_passages.recorded_turns` of a run without stiff
+        steps; None where that itself has to find them."""
+        system = self._mechanism_system
+        search = None if self._by_reference else _turn_search(system.mechanism)
+        if search is None:
+            return None
+        try:
+            with self.observables.all_rows() as all_rows:
+                given = all_rows, *search, _dip_search(scheme), dips.samples, dips.tops
+                others, turns = self._evaluated(lambda own: self._compiled.turns(own, *given))
+        except ArithmeticError:
+            return None
+        return dips.at_no_turn(others, [Turn(*turn) for turn in turns])
 
     @cached_property
     def _by_reference(self) -> bool:
@@ -172,10 +198,6 @@ class CompiledDenseOutput(DenseOutput):
         return core.DenseOutput(system.nq, system.nv, schemes, constants, steps)  # type: ignore[union-attr]
 
 
-def _as_array(t: FloatArray) -> FloatArray:
-    return np.ascontiguousarray(t, dtype=float)
-
-
 @lru_cache(maxsize=64)
 def _dip_search(scheme: ButcherTableau) -> Any:
     """``DipSearch`` of sigma_dips.hpp for the steps of ``scheme`` that are not stiff."""
@@ -198,25 +220,65 @@ def recorded_dips(scheme: ButcherTableau, steps: StepData) -> RecordedDips | Non
     schemes."""
     if np.logical_or.reduce(steps.stiff):
         return singular_passages.recorded_dips(scheme, steps)
-    found: RecordedDips | None = core.recorded_dips(  # type: ignore[union-attr]
+    found = core.recorded_dips(  # type: ignore[union-attr]
         _dip_search(scheme), steps.times, steps.sigmas, steps.end
     )
-    return found
+    return None if found is None else RecordedDips(*found)
 
 
-def without_passages(
+@per_start
+def _turn_search(mechanism: MechanismData) -> tuple[Any, Any] | None:
+    """``SeparatedRows`` and ``TurnSearch`` of turns.hpp; None for mechanisms with drives or with
+    many columns, of which the reference has faster algebra."""
+    geometry = geometry_of(mechanism, mechanism.q0)
+    if geometry.drives or geometry.model.nv > COMPILED_ABOVE:
+        return None
+    rows = separated_rows(geometry, singular_passages.singular_values(mechanism), [])
+    search = core.TurnSearch(  # type: ignore[union-attr]
+        unit=geometry.coordinate_unit,
+        rank=structure_of(mechanism).rank,
+        newton_steps=singular_passages.REVERSAL_STEPS,
+        resting=singular_passages.RESTING_SPEED,
+        together=singular_passages.VANISHING_TOGETHER,
+        untouched=singular_passages.UNTOUCHED_VALUE,
+    )
+    return rows, search
+
+
+def recorded_turns(
+    monitor: ConstraintMonitor, scheme: ButcherTableau, steps: StepData, dips: RecordedDips
+) -> RecordedDips:
+    """As :func:`srm_mbs.integration.singular_passages.recorded_turns`."""
+    if isinstance(monitor.dense, CompiledDenseOutput) and not np.logical_or.reduce(steps.stiff):
+        found = monitor.dense.turns(scheme, dips)
+        if found is not None:
+            return found
+    return singular_passages.recorded_turns(monitor, scheme, steps, dips)
+
+
+def dips_in_records(
     system: ClosedSystem | OpenSystem, scheme: ButcherTableau, dense: DenseOutput
-) -> bool:
-    """Whether records of the kernel show, before they are arrays, that a run away from singular
-    configurations has nothing that
-    :func:`~srm_mbs.integration.singular_passages.find_crossings` looks for."""
+) -> RecordedDips | tuple[()] | None:
+    """:func:`recorded_dips`, told from turns where the kernel can, of records of the kernel before
+    they are arrays; () if they show that
+    :func:`~srm_mbs.integration.singular_passages.find_crossings` finds nothing, None if they are
+    arrays, or have to be."""
     if not isinstance(dense, CompiledDenseOutput) or dense.recorded is None:
-        return False
+        return None
     analysis = system.singularities
     if analysis is None:
-        return True
-    followed = analysis.sigma_reference < SMALL_REFERENCE_PIVOT
-    return not followed and core.without_dips(_dip_search(scheme), *dense.recorded)  # type: ignore
+        return ()
+    records, stop = dense.recorded
+    if analysis.sigma_reference < SMALL_REFERENCE_PIVOT or records.stiff:
+        return None
+    found = core.dips_of_records(_dip_search(scheme), records, stop)  # type: ignore[union-attr]
+    if found is None:
+        return ()
+    dips = RecordedDips(*found)
+    others = dense.turns(scheme, dips)
+    if others is None:
+        return dips
+    return others if len(others.tops) or others.turns else ()
 
 
 def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> BoolArray:

@@ -140,7 +140,7 @@ class CompiledObservables(Observables):
             return deque(maxlen=1)
         return _idle_all_rows(mechanism)
 
-    def _all_rows(self) -> _Lent:
+    def all_rows(self) -> _Lent:
         """A kernel system of :func:`_make_all_rows` for one user."""
         return _Lent(self.idle, self.mechanism, self.system)
 
@@ -156,7 +156,7 @@ class CompiledObservables(Observables):
         if not self.mechanism.drives:
             return closure_errors(self.mechanism, t, q, v, self.system)
         try:
-            with self._all_rows() as kernel_system:
+            with self.all_rows() as kernel_system:
                 return kernel_system.closure_errors(*_states(t, q, v))  # type: ignore[no-any-return]
         except ArithmeticError:
             return super().closure_errors(t, q, v)
@@ -173,7 +173,7 @@ class CompiledObservables(Observables):
         """As the reference, with one pass over the bodies."""
         numbers = t, states, ends, whole, order, starts
         try:
-            with self._all_rows() as kernel_system:
+            with self.all_rows() as kernel_system:
                 return Invariants(*kernel_system.invariants(*numbers))
         except ArithmeticError:
             return super().invariants(*numbers)
@@ -181,7 +181,7 @@ class CompiledObservables(Observables):
     def jacobians(self, t: FloatArray, q: FloatArray) -> FloatArray:
         times, places = np.ascontiguousarray(t, dtype=float), np.ascontiguousarray(q)
         try:
-            with self._all_rows() as kernel_system:
+            with self.all_rows() as kernel_system:
                 return kernel_system.jacobians(times, places)  # type: ignore[no-any-return]
         except ArithmeticError:
             return super().jacobians(t, q)
@@ -207,7 +207,7 @@ class CompiledObservables(Observables):
             return super().smallest_values(geometry, values, k, t, q)
         rows, algebra, _ = prepared
         times, places = np.ascontiguousarray(t, dtype=float), np.ascontiguousarray(q)
-        with self._all_rows() as kernel_system:
+        with self.all_rows() as kernel_system:
             found: FloatArray = kernel_system.smallest_values(rows, algebra, times, places)
         others = np.isnan(found)  # other rows are active there
         if others.any():
@@ -225,7 +225,7 @@ class CompiledObservables(Observables):
         angles: FloatArray = NO_ANGLES,
     ) -> tuple[FloatArray, list[float]]:
         """As the reference."""
-        with self._all_rows() as kernel_system:
+        with self.all_rows() as kernel_system:
             return kernel_system.largest_differences(  # type: ignore[no-any-return]
                 a, b, unit, order, starts, turned, angles
             )
@@ -233,7 +233,7 @@ class CompiledObservables(Observables):
     def moved(self, states: FloatArray, motions: FloatArray) -> FloatArray:
         if states.shape[1] == motions.shape[1]:
             return states + motions
-        with self._all_rows() as kernel_system:
+        with self.all_rows() as kernel_system:
             return kernel_system.moved(states, motions)  # type: ignore[no-any-return]
 
     @staticmethod
@@ -242,7 +242,7 @@ class CompiledObservables(Observables):
         return core.largest_norms(x, order, starts)  # type: ignore[no-any-return,union-attr]
 
     def energies(self, q: FloatArray, v: FloatArray) -> FloatArray:
-        with self._all_rows() as kernel_system:
+        with self.all_rows() as kernel_system:
             return kernel_system.energies(np.concatenate((q, v), axis=1))  # type: ignore[no-any-return]
 
     def reactions(self, t: FloatArray, q: FloatArray, v: FloatArray) -> Reactions:
@@ -252,7 +252,7 @@ class CompiledObservables(Observables):
         if self._calls_python:
             return super().reactions(t, q, v)
         try:
-            with workspace(system) as kernel_system, self._all_rows() as all_rows_system:
+            with workspace(system) as kernel_system, self.all_rows() as all_rows_system:
                 structure = self.mechanism.structure
                 lam, on_b, joints = kernel_system.reactions(
                     all_rows_system,
@@ -305,7 +305,7 @@ class CompiledObservables(Observables):
         if compiled:
             structs = [force_struct(**own[name][0]) for name in compiled]
             try:
-                with self._all_rows() as kernel_system:
+                with self.all_rows() as kernel_system:
                     found = kernel_system.powers(*_states(t, q, v), structs, resting)
             except ArithmeticError:
                 return super()._powers(elements, t, q, v, resting)
@@ -326,7 +326,7 @@ class CompiledObservables(Observables):
         if structs is None:
             return super().stage_powers(chosen, times, states, rates, A, c)
         try:
-            with self._all_rows() as kernel_system:
+            with self.all_rows() as kernel_system:
                 found = kernel_system.stage_powers(
                     chosen.tolist(), times, states, rates, A, c, structs
                 )
@@ -344,7 +344,7 @@ class CompiledObservables(Observables):
         if structs is None:
             return None
         try:
-            with self._all_rows() as kernel_system:
+            with self.all_rows() as kernel_system:
                 found = dense.works(kernel_system, t, structs, A, b, c)
         except ArithmeticError:
             return None
@@ -375,18 +375,24 @@ def _separated_rows(
     algebra = values.compiled(active)
     if algebra is None:
         return None
+    rows = separated_rows(geometry, values, np.flatnonzero(active).tolist())
+    return rows, algebra.compiled, int(active.sum())
+
+
+def separated_rows(geometry: ClosureGeometry, values: SingularValues, active: list[int]) -> Any:
+    """``SeparatedRows`` of separated_rows.hpp, those of ``geometry``, with singular ``values``; the
+    ``active`` ones are the rows of an algebra."""
     shares = geometry.shares
-    rows = core.SeparatedRows(  # type: ignore[union-attr]
+    return core.SeparatedRows(  # type: ignore[union-attr]
         supports=values.supports,
         factors=geometry.row_factors,
         share_rows=[row for row, _, _ in shares],
         share_others=[other for _, other, _ in shares],
         shares=np.array([share for *_, share in shares]),
-        left=geometry.left if shares else np.ones(len(active)),
-        active=np.flatnonzero(active).tolist(),
+        left=geometry.left if shares else np.ones(len(values.supports)),
+        active=active,
         inert=INERT,
     )
-    return rows, algebra.compiled, int(active.sum())
 
 
 def _states(t: FloatArray, q: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -81,6 +81,8 @@ class Linearisation:
         Derivatives of the laws by the chart coordinates.
     by_laws : (n, m)
         Derivatives of the chart rates by what acts in place of the laws.
+    on_branch
+        Whether they are those of the rates on the branch next to a singular configuration.
     """
 
     rate: FloatArray
@@ -90,6 +92,7 @@ class Linearisation:
     laws: FloatArray
     by_coordinates: FloatArray
     by_laws: FloatArray
+    on_branch: bool
 
 
 @dataclass

@@ -26,6 +26,12 @@ r = F - y, adds W r to the right-hand side, and the rate of y is r / (h gamma) +
 More laws than degrees of freedom are one, y = M (1 - P) M^-1 B F: closures take up the rest, which
 may grow with c.
 
+**Next to a singular configuration** stages are evaluated at their projection on the branch
+(:mod:`srm_mbs.integration.methods.near_singular`): what is integrated there are the rates at the
+nearest place on the branch, and J is their derivative.  Along the branch it is as smooth as the
+motion, along the normals it is 0; that of the rates off the branch grows like 1/sigma^2.  So J is
+found by differences along the tangents (1 - P) e_j, at projected places.
+
 Everything else, the correction at the end, the zone and the placement, is that of explicit steps;
 only stages of motions that linger next to a singular configuration are not solved by nodes of the
 branch.
@@ -39,8 +45,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.system import System, Zone
+from srm_mbs.dynamics.system import System, Terms
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Linearisation, StepResult
+from srm_mbs.integration.methods.near_singular import BranchStages
 from srm_mbs.integration.methods.split_step import SplitStep, Stages
 from srm_mbs.integration.methods.stiffness import largest_eigenvalue
 from srm_mbs.model.lazy import cached_property
@@ -66,19 +73,34 @@ def linearised(
     state: FloatArray,
     memory: IntegratorState,
     norm: ErrorNorm,
-    zone: Zone | None,
+    branch: BranchStages | None,
 ) -> Linearisation:
-    """``system`` linearised at ``state`` (nx,) and ``t`` (s), for steps of about ``h`` (s)."""
+    """``system`` linearised at ``state`` (nx,) and ``t`` (s), for steps of about ``h`` (s), whose
+    stages are those of ``branch``."""
     n, k = system.tangent_size, system.multiplier_part.start
     unit = norm.one if norm.unit is None else norm.unit
+    zone, on_branch = (None, False) if branch is None else (branch.zone, branch.near)
+
+    def terms_at(time: float, x: FloatArray) -> Terms:
+        terms = system.evaluate(time, x, zone)
+        if on_branch and not terms.rank_deficient:
+            terms = system.evaluate(time, system.retract(x, -terms.correction()), zone)
+        return terms
 
     def rate_at(time: float, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        rate = system.evaluate(time, x, zone).rate().copy()
+        rate = terms_at(time, x).rate().copy()
         return rate, system.laws
 
     # The rate of the memory is the one before the last correction, which stiff forces notice.
     system.apply_laws(memory.laws)
-    rate, laws = rate_at(t, state)
+    terms = terms_at(t, state)
+    rate, laws, directions = terms.rate().copy(), system.laws, np.eye(n)
+    along = on_branch and not terms.rank_deficient
+    if along:
+        size = n - k  # of positions and of rates, or of all unknowns
+        tangents = np.transpose([e - terms.project(e) for e in np.eye(size)])
+        for start in range(0, n, size):
+            directions[start : start + size, start : start + size] = tangents
     applied = laws if memory.laws is None else memory.laws
     m = len(applied)
     system.apply_laws(applied if m else None)
@@ -86,7 +108,7 @@ def linearised(
     # Accelerations are linear in what acts in place of the laws.
     change = max(1.0, float(np.abs(applied).max(initial=0.0)))
     J, by_coordinates, by_laws = np.zeros((n, n)), np.empty((m, n)), np.zeros((n, m))
-    known = system.derivatives(state, rate[k:])
+    known = None if along else system.derivatives(state, rate[k:])
     held = rate[k:] if known is None else known.forces(t, state)
 
     def probe(step: float, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -100,8 +122,7 @@ def linearised(
         return there, known.by_forces @ ((forces - held) / step), system.laws
 
     for j, step in enumerate(steps.tolist()):
-        delta = np.zeros(n)
-        delta[j] = step
+        delta = step * directions[:, j]
         there, J[k:, j], own = probe(step, system.retract(state, delta))
         J[:k, j] = (system.chart_rate(delta, there) - rate)[:k] / step
         by_coordinates[:, j] = (own - laws) / step
@@ -118,7 +139,7 @@ def linearised(
         tau = float(rounded_down(np.array(max(TIME_DIFFERENCE * h, shortest))))
         first, second = (rate_at(t + i * tau, state)[0] - rate for i in (1.0, 2.0))
         by_time = (4.0 * first - second) / (2.0 * tau)
-    return Linearisation(rate, J, by_time, applied, laws, by_coordinates, by_laws)
+    return Linearisation(rate, J, by_time, applied, laws, by_coordinates, by_laws, on_branch)
 
 
 class LinearStages:
@@ -191,7 +212,7 @@ class LinearSplitStep(SplitStep):
         state: FloatArray,
         memory: IntegratorState,
         norm: ErrorNorm,
-        zone: Zone | None,
+        branch: BranchStages | None,
         rates: FloatArray,
     ) -> Stages:
         """See :class:`SplitStep`; the equations are linearised here."""
@@ -200,8 +221,8 @@ class LinearSplitStep(SplitStep):
         scheme, n, implicit = self.scheme, system.tangent_size, self._implicit
         lead, end = scheme.lead, scheme.n_stages
         known = memory.linearisation
-        if known is None:
-            known = linearised(system, t, h, state, memory, norm, zone)
+        if known is None or known.on_branch != (branch is not None and branch.near):
+            known = linearised(system, t, h, state, memory, norm, branch)
             memory.linearisation = known
         gamma = float(implicit[lead, lead])
         factors = lu_factor(np.eye(n) - h * gamma * known.J, check_finite=False)

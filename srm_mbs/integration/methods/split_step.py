@@ -25,7 +25,7 @@ from typing import Protocol
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.system import System, Zone
+from srm_mbs.dynamics.system import System
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, StepResult
 from srm_mbs.integration.methods.branch_nodes import BRANCH_SIGMA, StageNodes
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -104,7 +104,7 @@ class SplitStep:
         state: FloatArray,
         memory: IntegratorState,
         norm: ErrorNorm,
-        zone: Zone | None,
+        branch: BranchStages | None,
         rates: FloatArray,
     ) -> Stages | None:
         """The stages of one step, None where the rates of the scheme are the chart rates; ``rates``
@@ -155,7 +155,7 @@ class SplitStep:
         rates = np.zeros((s + 1, system.tangent_size))
         weighed = rates[:s]
         first = scheme.lead + 1
-        stages = self.stage_rates(system, t, h, state, memory, norm, zone, rates)
+        stages = self.stage_rates(system, t, h, state, memory, norm, branch, rates)
         all_sigmas = [start] * first
         deficient: list[tuple[int, int, bool]] = []
         delta = np.zeros(system.tangent_size)

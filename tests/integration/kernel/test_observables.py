@@ -302,7 +302,7 @@ def test_rows_of_another_system_are_refused() -> None:
     )
     rows, algebra, _ = compiled._separated[1]  # type: ignore[index]
     with (
-        both(other)[0]._all_rows() as kernel_system,  # type: ignore[attr-defined]
+        both(other)[0].all_rows() as kernel_system,  # type: ignore[attr-defined]
         pytest.raises(ValueError, match="not those of the system"),
     ):
         kernel_system.smallest_values(rows, algebra, np.zeros(1), other.q0[None])

@@ -1,0 +1,161 @@
+#include "turns.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include <Eigen/Dense>
+
+namespace srm {
+
+namespace {
+
+using RowMatrix = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+using Rows = Eigen::Map<const RowMatrix>;
+
+// The step in which all rates change their sign, and when (s) they vanish.
+struct Reversal {
+    long step;
+    double time;
+};
+
+class TurnFinder {
+public:
+    TurnFinder(const TurnSearch& search, const SeparatedRows& rows, System& all_rows,
+               const DipSearch& dips, DenseOutput& dense, System& system)
+        : search_(search),
+          rows_(rows),
+          all_rows_(all_rows),
+          dips_(dips),
+          dense_(dense),
+          system_(system),
+          steps_(dense.steps()),
+          stages_(static_cast<long>(dips.columns.size())),
+          nv_(system.nv),
+          nq_(system.nq),
+          state_(nq_ + nv_),
+          change_(nv_),
+          G_(rows.factors.size()) {}
+
+    Turns among(const SigmaDips& recorded) {
+        const auto& dips = recorded.dips;
+        const std::size_t n = dips.size();
+        Turns out{std::vector<char>(n), {}};
+        for (std::size_t first = 0, next; first < n; first = next) {
+            next = first + 1;
+            while (next < n && dips[next - 1][2] == dips[next][0]) ++next;
+            // A turn beyond may show as several dips, one next to the other.
+            if (next > first + 1 && turns(recorded, first, next - 1, out)) continue;
+            for (std::size_t i = first; i < next; ++i) turns(recorded, i, i, out);
+        }
+        return out;
+    }
+
+private:
+    const double* state(long end) const { return steps_.states + end * (nq_ + nv_); }
+    double rate(long end, int k) const { return state(end)[nq_ + k] / search_.unit[k]; }
+
+    // Whether the dips from `from` to `to` are those of one turn, which is then added to `out`.
+    bool turns(const SigmaDips& recorded, std::size_t from, std::size_t to, Turns& out) {
+        const auto& dips = recorded.dips;
+        const long first = std::max(dips[from][0] - 1, 0L) / stages_;
+        const long last = (dips[to][2] - 1) / stages_;
+        // Nothing is read beyond an event that ends the run.
+        if (!(steps_.times[last + 1] <= steps_.end)) return false;
+        if (from > 0 && dips[from - 1][1] >= first * stages_) return false;
+        if (to + 1 < dips.size() && dips[to + 1][1] <= (last + 1) * stages_) return false;
+        Reversal reversal;
+        Turn turn;
+        if (!reverses(first, last, reversal) ||
+            !certain(first, last, reversal, recorded.tops[from], turn))
+            return false;
+        for (std::size_t i = from; i <= to; ++i) out.found[i] = 1;
+        if (turn.values[0] < 0.0) out.beyond.push_back(turn);
+        return true;
+    }
+
+    // Whether all rates change their sign in one of the steps, once.
+    bool reverses(long first, long last, Reversal& out) {
+        long found = -1;
+        for (long step = first; step <= last; ++step) {
+            double along = 0.0;
+            for (int k = 0; k < nv_; ++k) along += rate(step, k) * rate(step + 1, k);
+            if (!(along < 0.0)) continue;
+            if (found >= 0) return false;
+            found = step;
+        }
+        if (found < 0) return false;
+        double size = 0.0, before = 0.0, after = 0.0, both = 0.0;
+        for (int k = 0; k < nv_; ++k) {
+            const double a = rate(found, k), b = rate(found + 1, k);
+            change_[k] = b - a;
+            size += change_[k] * change_[k];
+            before += a * change_[k];
+            after += b * change_[k];
+            both += a * a + b * b;
+        }
+        const double resting = search_.resting * size;
+        if (!(size * both - before * before - after * after < resting * resting)) return false;
+        const double start = steps_.times[found], end = steps_.times[found + 1];
+        double t = start - before / size * (end - start);
+        for (int i = 0; i < search_.newton_steps; ++i) {
+            dense_.states(system_, &t, 1, state_.data());
+            double along = 0.0;
+            for (int k = 0; k < nv_; ++k) along += state_[nq_ + k] / search_.unit[k] * change_[k];
+            t = std::clamp(t - along / size * (end - start), start, end);
+        }
+        out = {found, t};
+        return true;
+    }
+
+    Rows rows_at(double t, const double* q) {
+        rows_.write(all_rows_, t, q, G_);
+        return Rows(G_.data(), static_cast<long>(rows_.supports.size()), nv_);
+    }
+
+    // Whether the motion certainly did not touch the singular configuration.
+    bool certain(long first, long last, const Reversal& reversal, long top, Turn& turn) {
+        turn.times = {steps_.times[first], reversal.time, steps_.times[last + 1]};
+        turn.top = top;
+        dense_.states(system_, &reversal.time, 1, state_.data());
+        svd_.compute(rows_at(reversal.time, state_.data()),
+                     Eigen::ComputeThinU | Eigen::ComputeThinV);
+        const int k = search_.rank - 1;
+        const Eigen::VectorXd& sizes = svd_.singularValues();
+        const double value = sizes[k];
+        if (k > 0 && !(sizes[k - 1] > search_.together * value)) return false;
+        turn.values[1] = value;
+        for (const int side : {0, 2}) {
+            const Rows G = rows_at(turn.times[side], state(side ? last + 1 : first));
+            turn.values[side] = svd_.matrixU().col(k).dot(G * svd_.matrixV().col(k));
+        }
+        if (!(turn.values[0] * turn.values[2] > 0.0)) return false;
+        // The largest value of the window follows from the recorded sigmas.
+        const long width = dense_.sigma_width(), at = std::max(top - 1, 0L);
+        const double untouched = search_.untouched *
+                                 steps_.sigmas[at / stages_ * width + dips_.columns[at % stages_]];
+        return value * steps_.sigmas[first * width] > untouched * std::abs(turn.values[0]) &&
+               value * steps_.sigmas[(last + 1) * width - 1] > untouched * std::abs(turn.values[2]);
+    }
+
+    const TurnSearch& search_;
+    const SeparatedRows& rows_;
+    System& all_rows_;
+    const DipSearch& dips_;
+    DenseOutput& dense_;
+    System& system_;
+    const StepArrays& steps_;
+    const long stages_;
+    const int nv_, nq_;
+    std::vector<double> state_, change_, G_;
+    Eigen::JacobiSVD<RowMatrix> svd_;
+};
+
+}  // namespace
+
+Turns recorded_turns(const TurnSearch& search, const SeparatedRows& rows, System& all_rows,
+                     const DipSearch& dips, const SigmaDips& recorded, DenseOutput& dense,
+                     System& system) {
+    return TurnFinder(search, rows, all_rows, dips, dense, system).among(recorded);
+}
+
+}  // namespace srm

@@ -1,0 +1,46 @@
+// Where a motion turns back next to a singular configuration: recorded_turns() of
+// integration/singular_passages.py.
+#pragma once
+
+#include <array>
+#include <vector>
+
+#include "dense.hpp"
+#include "separated_rows.hpp"
+#include "sigma_dips.hpp"
+#include "struct_fields.hpp"
+
+namespace srm {
+
+#define SRM_TURN_SEARCH(field)                                                              \
+    field(std::vector<double>, unit) /* (nv,) of the coordinates */                         \
+    field(int, rank)                 /* structural, of the rows */                          \
+    field(int, newton_steps)         /* to where the rates vanish */                        \
+    field(double, resting)           /* rate there, over its change in the step */          \
+    field(double, together)          /* the next singular value, over the smallest */       \
+    field(double, untouched)         /* the smallest, over the largest sigma of the window */
+
+struct TurnSearch {
+    SRM_FIELDS(SRM_TURN_SEARCH)
+
+    void check() const { expect_within("rank", rank, 1, 1 << 20); }
+};
+
+struct Turn {
+    std::array<double, 3> times;   // the end of a step, the turn, and the other end (s)
+    std::array<double, 3> values;  // the smallest singular value there, positive at the turn
+    long top;
+};
+
+struct Turns {
+    std::vector<char> found;   // whether each dip is certainly at a turn
+    std::vector<Turn> beyond;  // those beyond the singular configuration
+};
+
+// rows, all_rows: as of SeparatedRows::write.  dense, of steps of the tableau that `dips` is for, is
+// read with `system`.
+Turns recorded_turns(const TurnSearch& search, const SeparatedRows& rows, System& all_rows,
+                     const DipSearch& dips, const SigmaDips& recorded, DenseOutput& dense,
+                     System& system);
+
+}  // namespace srm

@@ -711,6 +711,7 @@ class ClosedSystem(Mechanics):
             units.coordinate,
             units.rate,
             partial(geometry_of, self.mechanism),
+            self.driven,
         )
 
     @property

@@ -131,6 +131,8 @@ class SingularityAnalysis:
         (q (nq,), t (s) or None, the default) -> the closure equations with units measured at q,
         and the laws of the drives as they are at t
         (:func:`~srm_mbs.dynamics.constraints.geometry.geometry_of`).
+    driven
+        Whether there are drives.
     """
 
     q0: FloatArray
@@ -139,6 +141,7 @@ class SingularityAnalysis:
     coordinate_unit: FloatArray
     rate_unit: float
     geometry: Callable[..., ClosureGeometry]
+    driven: bool
 
     def split(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Views (q, v) of a state (nx,), or of states (n, nx)."""

@@ -953,8 +953,7 @@ def find_crossings(
         t, _ = _recorded(scheme, steps)
         values = monitor.smallest(t)
         recorded = _dips(t, values / np.median(values), scheme.n_stages)
-    driven = analysis.geometry(analysis.split(steps.states[0])[0], float(steps.times[0])).drives
-    resolved = _resolved_dips(scheme, steps) if driven else []
+    resolved = _resolved_dips(scheme, steps) if analysis.driven else []
     if recorded is None and not steps.critical_ranges and not resolved:
         return ()
     monitor = monitor or ConstraintMonitor(analysis, *monitored())

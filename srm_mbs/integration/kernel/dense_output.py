@@ -273,7 +273,7 @@ def dips_in_records(
     if analysis.sigma_reference < SMALL_REFERENCE_PIVOT or records.stiff:
         return None
     # Of driven mechanisms, layers that steps resolve are looked for as well.
-    layers = system.mechanism.drives and records.least_sigma < AVOIDED_SIGMA
+    layers = analysis.driven and records.least_sigma < AVOIDED_SIGMA
     nothing = None if layers else ()
     found = core.dips_of_records(_dip_search(scheme), records, stop)  # type: ignore[union-attr]
     if found is None:

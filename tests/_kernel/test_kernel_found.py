@@ -122,6 +122,7 @@ def test_python_and_the_command_line_use_the_kernel_in_every_folder(
         assert "not available" not in shown.stdout
 
 
+@pytest.mark.stress
 def test_the_benchmark_of_a_checkout_measures_the_kernel(machine: Machine) -> None:
     run = machine.python(machine.checkout, machine.script, *BENCHMARK)
     assert run.returncode == 0, run.stderr
@@ -138,6 +139,7 @@ def test_the_benchmark_of_a_checkout_measures_the_kernel(machine: Machine) -> No
     assert "top of a checkout" in elsewhere.stderr
 
 
+@pytest.mark.stress
 def test_a_checkout_with_changed_sources_warns_once_and_its_benchmark_refuses(
     tmp_path: Path,
 ) -> None:

@@ -16,7 +16,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
-from tests.support.backends import on_both
+from tests.support.backends import on_both, slowly_on_both
 from tests.support.bundled import load
 from tests.support.mechanisms import along_x, ball_dead_point, rod
 
@@ -309,7 +309,7 @@ def test_a_drive_that_leads_beyond_its_dead_point_ends_the_run_there() -> None:
     assert solution.t[-1] == pytest.approx(0.5 * np.pi, abs=2e-3)
 
 
-@on_both
+@slowly_on_both
 @pytest.mark.parametrize("rtol", [1e-4, 1e-9])
 @pytest.mark.parametrize("short", [-1e-4, -0.01, -0.1])
 def test_a_run_that_stops_at_a_dead_point_says_when_and_which_drive_and_nothing_of_stiffness(

@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from tests.support import reduced
-from tests.support.backends import on_both
+from tests.support.backends import slowly_on_both
 
 CRANK, ROD, LINK, ROCKER = 1.0, 1.3, 0.7, 0.9
 """Lengths (m) of the bars; link and rocker lie on each other."""
@@ -59,7 +59,7 @@ DRIVEN = [(), ("O",), ("D",), ("A",)]
 STARTS = [(1.0, 1.0, 0), (0.5, 2.0, 0), (-1.0, 1.0, 1), (1.0, 3.0, 1), (0.0, 1.0, 0)]
 
 
-@on_both
+@slowly_on_both
 @pytest.mark.parametrize("joint", DRIVEN, ids=lambda joint: "".join(joint) or "free")
 @pytest.mark.parametrize("start", STARTS)
 def test_the_motion_is_the_one_that_arrives_at_the_start_when_it_is_reversed(
@@ -91,7 +91,7 @@ def test_the_motion_is_the_one_that_arrives_at_the_start_when_it_is_reversed(
     np.testing.assert_allclose(at_start[4:], mechanism.v0, atol=1e-5)
 
 
-@on_both
+@slowly_on_both
 @pytest.mark.parametrize("joint", ["O", "A"])
 def test_rates_off_the_cone_are_refused_with_the_nearest_ones_on_it(
     joint: str, backend: str

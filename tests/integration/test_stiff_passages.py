@@ -14,6 +14,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
+from tests.support.backends import slowly_on_both
 
 BRANCHES = {"parallelogram": (1.0, -1.0, 1.0), "slider_crank": (1.0, -2.0)}
 SPEED = 1e-3  # of friction, rad/s
@@ -46,7 +47,7 @@ def motion(mechanism: srm.Mechanism, w: np.ndarray, rate: float, t_end: float) -
     return np.asarray(mechanism.q0 + run.y[0, -1] * w)
 
 
-@pytest.mark.parametrize("backend", ["kernel", "python"])
+@slowly_on_both
 @pytest.mark.parametrize("name", list(BRANCHES))
 @pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-9])
 def test_implicit_steps_pass_singular_configurations_within_the_tolerance(
@@ -61,7 +62,7 @@ def test_implicit_steps_pass_singular_configurations_within_the_tolerance(
     assert run.stats.rejected < 0.5 * run.stats.steps
 
 
-@pytest.mark.parametrize("backend", ["kernel", "python"])
+@slowly_on_both
 @pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
 @pytest.mark.parametrize(
     ("name", "damping", "friction"),
@@ -82,7 +83,7 @@ def test_damped_motions_pass_singular_configurations(
     assert np.abs(run.q[-1] - motion(mechanism, w, 9.0, 1.0)).max() < 1e-6
 
 
-@pytest.mark.parametrize("backend", ["kernel", "python"])
+@slowly_on_both
 @pytest.mark.parametrize("rtol", [1e-6, 1e-8])
 def test_implicit_steps_keep_the_energy_through_a_spatial_dead_point(
     rtol: float, backend: str

@@ -15,7 +15,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.integration.kernel import driver
 from srm_mbs.simulation import streamed_output
-from tests.support.backends import on_both
+from tests.support.backends import needs_kernel, on_both
 from tests.support.bundled import load
 from tests.support.mechanisms import floating_ring
 from tests.support.memory import ON_LINUX
@@ -150,14 +150,15 @@ def test_ten_thousand_turns_with_two_output_times_take_little_memory() -> None:
     assert megabytes < 100.0
 
 
+@needs_kernel
 def test_a_run_whose_steps_would_fill_the_memory_ends_and_says_to_give_output_times(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     mechanism = load("squeezing_mechanism")  # whose motor has no limit: ever more steps a second
-    whole = srm.simulate(mechanism, 2.0)
-    monkeypatch.setattr(driver, "MOST_STEP_BYTES", 2e7)
+    whole = srm.simulate(mechanism, 1.0, backend="kernel")
+    monkeypatch.setattr(driver, "MOST_STEP_BYTES", 5e6)
     with pytest.warns(srm.FailedRunWarning):
-        ended = srm.simulate(mechanism, 2.0)
+        ended = srm.simulate(mechanism, 1.0, backend="kernel")
     assert not ended.success
     assert "of the memory of this machine. Everything up to there is kept. Give t_eval" in (
         ended.message
@@ -170,8 +171,8 @@ def test_a_run_whose_steps_would_fill_the_memory_ends_and_says_to_give_output_ti
     driven = replace(load("slider_crank_regular"), drives=(motor,))
     driven = driven.with_state(srm.assemble(driven).q, srm.assemble(driven).v)
     with pytest.warns(srm.FailedRunWarning):
-        turning = srm.simulate(driven, 1e6, max_step=1e-3)
+        turning = srm.simulate(driven, 1e6, max_step=1e-3, backend="kernel")
     assert turning.message.endswith("the run then keeps no other state.")
-    sampled = srm.simulate(mechanism, 2.0, t_eval=[1.0, 2.0])
+    sampled = srm.simulate(mechanism, 1.0, t_eval=[0.5, 1.0], backend="kernel")
     assert sampled.success
-    np.testing.assert_array_equal(sampled.q, whole([1.0, 2.0])[0])
+    np.testing.assert_array_equal(sampled.q, whole([0.5, 1.0])[0])

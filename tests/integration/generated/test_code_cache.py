@@ -365,6 +365,7 @@ def test_each_unit_and_their_link_may_fail(program: Path, folder: Path, failing:
     assert not list(folder.iterdir())
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("hanging", ["/1.c", "/2.c", "-shared"])
 def test_each_unit_and_their_link_may_hang(
     program: Path, folder: Path, tmp_path: Path, hanging: str

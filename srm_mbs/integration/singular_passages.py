@@ -19,6 +19,7 @@ Both are found after the run, on its dense output.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, insort
 from collections.abc import Callable, Collection, Generator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -705,16 +706,14 @@ def recorded_turns(
     ends = np.append(starts[1:], len(every)) - 1
     several = ends > starts
     lowest, highest = np.append(starts[several], every), np.append(ends[several], every)
-    first, last = (
-        (np.maximum(samples[lowest, 0] - 1, 0)) // stages,
-        (samples[highest, 2] - 1) // stages,
-    )
+    first = np.maximum(samples[lowest, 0] - 1, 0) // stages
+    last = (samples[highest, 2] - 1) // stages
     # Nothing is read beyond an event that ends the run.
-    before, after = np.append(-1, samples[:, 1]), np.append(samples[:, 1], np.iinfo(int).max)
+    before, after = np.append(-1, samples[:, 1]), np.append(samples[1:, 1], np.iinfo(int).max)
     alone = (
         (steps.times[last + 1] <= steps.end)
-        & ((lowest == 0) | (before[lowest] < first * stages))
-        & (after[highest + 1] > (last + 1) * stages)
+        & (before[lowest] < first * stages)
+        & (after[highest] > (last + 1) * stages)
     )
     own = np.flatnonzero(alone)
     found, t, q = _reversals(monitor, steps, first[own], last[own])
@@ -854,9 +853,8 @@ def _crossings_along_curves(monitor: ConstraintMonitor, steps: StepData) -> list
     return found
 
 
-def _resolved_dips(scheme: ButcherTableau, steps: StepData) -> list[int]:
-    """Indices of the recorded minima of sigma below AVOIDED_SIGMA."""
-    _, sigma = _recorded(scheme, steps)
+def _resolved_dips(sigma: FloatArray) -> list[int]:
+    """Indices of the minima of the recorded ``sigma`` (k,) below AVOIDED_SIGMA."""
     inner = sigma[1:-1]
     lowest = (inner <= sigma[:-2]) & (inner < sigma[2:]) & (inner < AVOIDED_SIGMA)
     return (np.flatnonzero(lowest) + 1).tolist()
@@ -864,24 +862,26 @@ def _resolved_dips(scheme: ButcherTableau, steps: StepData) -> list[int]:
 
 def _avoided_by_steps(
     monitor: ConstraintMonitor,
-    scheme: ButcherTableau,
     steps: StepData,
+    t: FloatArray,
     dips: Sequence[int],
     listed: Collection[float],
 ) -> list[Crossing]:
     """The critical configurations that the motion of a driven mechanism avoided at those of the
-    recorded ``dips`` next to which no passage is ``listed`` (s).
+    recorded ``dips``, samples at t (k,) s, next to which no passage is ``listed`` (s).
 
     Where a drive turns back, steps may resolve a layer that others follow along the curve.
     """
-    t, _ = _recorded(scheme, steps)
     found: list[Crossing] = []
+    known = sorted(listed)
     for k in dips:
-        first, last = max(k - DIP_WIDTHS[-1], 0), min(k + DIP_WIDTHS[-1], len(t) - 1)
-        times = np.linspace(t[first], t[last], SAMPLES)
-        known = (*listed, *(crossing.time for crossing in found))
-        if any(times[0] <= time <= times[-1] for time in known) or _along_curve(steps, t[k]):
+        first = float(t[max(k - DIP_WIDTHS[-1], 0)])
+        last = float(t[min(k + DIP_WIDTHS[-1], len(t) - 1)])
+        next_known = bisect_left(known, first)
+        is_known = next_known < len(known) and known[next_known] <= last
+        if is_known or _along_curve(steps, t[k]):
             continue
+        times = np.linspace(first, last, SAMPLES)
         values = monitor.smallest(times)
         lowest = int(values.argmin())
         if not 0 < lowest < len(times) - 1:
@@ -890,8 +890,8 @@ def _avoided_by_steps(
         time = monitor.minimum(times[near], values[near])
         if monitor.is_regular(time, times[near][[0, 2]].tolist()) or not monitor.avoids(time):
             continue
-        beside = 0.25 * float(times[-1] - times[0])
-        found.append(crossing_at(monitor, steps, time, beside, "avoided"))
+        found.append(crossing_at(monitor, steps, time, 0.25 * (last - first), "avoided"))
+        insort(known, time)
     return found
 
 
@@ -953,7 +953,10 @@ def find_crossings(
         t, _ = _recorded(scheme, steps)
         values = monitor.smallest(t)
         recorded = _dips(t, values / np.median(values), scheme.n_stages)
-    resolved = _resolved_dips(scheme, steps) if analysis.driven else []
+    resolved: list[int] = []
+    if recorded is not None or analysis.driven:
+        t, sigma = _recorded(scheme, steps)
+        resolved = _resolved_dips(sigma) if analysis.driven else []
     if recorded is None and not steps.critical_ranges and not resolved:
         return ()
     monitor = monitor or ConstraintMonitor(analysis, *monitored())
@@ -961,7 +964,6 @@ def find_crossings(
     if recorded is not None:
         if recorded.turns is None:
             recorded = turns_of(monitor, scheme, steps, recorded)
-        t, _ = _recorded(scheme, steps)
         searches = [
             _crossings_at(monitor, steps, t, dip, top)
             for dip, top in zip(recorded.samples.tolist(), recorded.tops.tolist())
@@ -971,8 +973,9 @@ def find_crossings(
     for crossings in (*monitor.together(searches), _crossings_along_curves(monitor, steps)):
         for crossing in crossings:
             found.setdefault(crossing.time, crossing)
-    for crossing in _avoided_by_steps(monitor, scheme, steps, resolved, found):
-        found[crossing.time] = crossing
+    if resolved:
+        for crossing in _avoided_by_steps(monitor, steps, t, resolved, found):
+            found[crossing.time] = crossing
     return tuple(found[time] for time in sorted(found))
 
 

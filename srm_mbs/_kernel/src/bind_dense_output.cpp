@@ -270,9 +270,10 @@ nb::object dips_of_records(const DipSearch& search, const PyRecords& records,
     return dips_of(search, steps.times, steps.sigmas, steps.count, records.stages, steps.end);
 }
 
-// Of each step with sigma (n, abscissae) 1 if its stages lie close to a singular configuration, else 0.
+// Of each step with sigma (n, abscissae) 1 if its stages lie close to a singular configuration, else
+// 0.
 nb::object py_close_to_singular(const std::vector<double>& abscissae, const Array& sigmas,
-                                       const DenseConstants& constants) {
+                                const DenseConstants& constants) {
     if (sigmas.ndim() != 2 || sigmas.shape(1) != abscissae.size())
         throw nb::value_error("sigmas has another shape");
     std::vector<double> out(sigmas.shape(0));

@@ -93,7 +93,7 @@ void LinearStages::linearise(double t, double h, const double* state,
         system_.law_accelerations(W_.data());
         along_branch(t, state, steps, zone);
     } else if (system_.linearise(t, state, &rate_[nv], steps, C_.data(), D_.data(), W_.data(),
-                          L_.data())) {
+                                 L_.data())) {
         chart_by_coordinates(steps);
     } else {
         system_.law_accelerations(W_.data());
@@ -120,6 +120,7 @@ void LinearStages::linearise(double t, double h, const double* state,
         by_time_[i] = (4.0 * (probe_[i] - rate_[i]) - (other_[i] - rate_[i])) / (2.0 * tau);
 }
 
+// On the branch at the projection of `state`.
 void LinearStages::rate_at(double t, const double* state, const System::ZoneView& zone,
                            std::vector<double>& out) {
     system_.evaluate(t, state, zone);

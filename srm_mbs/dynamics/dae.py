@@ -207,9 +207,9 @@ class DaeTerms:
 PROBES = 24
 """Points around the start at which the typical sizes of G and B are measured."""
 PROBE_DISTANCE = 0.1
-"""Their distance, in units of max(1, |x|)."""
+"""Their distance, in the units of the states."""
 DIFFERENCE = 1e-6
-"""Step of the finite differences that check G and g_t, relative to x and to the run."""
+"""Step of the finite differences that check G and g_t, relative to max(1, |x|) and to the run."""
 FINER = tuple(10.0**-k for k in range(9))
 """Lengths of that step, over the usual one, until the differences settle: x may be of a smaller
 size than its unit, and g vary faster than the run is long."""
@@ -251,6 +251,17 @@ def _other_slope(
     return last
 
 
+def _units(x0: FloatArray, one: FloatArray) -> FloatArray:
+    """Sizes (nx,) of the states: |x0|, or what the tolerance is absolute to, ``one``, between 1 and
+    the largest state; 1 at the origin, where the states tell nothing.
+
+    Within them nothing distinguishes a small circle from a point next to a singular one.
+    """
+    largest = float(np.abs(x0).max()) or 1.0
+    least = np.clip(one, min(1.0, largest), max(1.0, largest))
+    return np.maximum(np.abs(x0), least).astype(np.float64, copy=False)
+
+
 class DaeSystem:
     """A :class:`~srm_mbs.model.dae.SemiExplicitDAE` as a :class:`~srm_mbs.dynamics.system.System`.
 
@@ -262,6 +273,8 @@ class DaeSystem:
         Start of the run; x0 (nx,).
     t_end
         End of the run.
+    one
+        atol / rtol (nx,): sizes of the states below which the tolerance is absolute.
     T
         ``"identity"``, ``"transpose"`` or ``"inverse"``: the factor of g in the sweeps.
 
@@ -285,13 +298,14 @@ class DaeSystem:
         t0: float,
         x0: FloatArray,
         t_end: float,
+        one: FloatArray,
         T: str = "identity",
     ) -> None:
         self.problem = problem
         self.T = T
         self.evaluations = 0
         self.nx = len(x0)
-        self._unit = np.maximum(1.0, np.abs(x0))
+        self._unit = _units(x0, one)
         self.ny = self._count_rows(t0, x0)
         self.shapes = {
             "f": (self.nx,),
@@ -425,7 +439,7 @@ class DaeSystem:
 
             def slope_over(finer: float, i: int = i) -> FloatArray:
                 step = np.zeros(self.nx)
-                step[i] = finer * DIFFERENCE * self._unit[i]
+                step[i] = finer * DIFFERENCE * max(1.0, abs(x[i]))
                 ahead, behind = self.call("g", t, x + step), self.call("g", t, x - step)
                 return np.asarray((ahead - behind) / (2.0 * step[i]))
 
@@ -518,8 +532,8 @@ class DaeSystem:
         """None: its functions are known at single points only."""
 
     def position_norm(self, delta: FloatArray) -> float:
-        """max |dx|; see :class:`~srm_mbs.dynamics.system.System`."""
-        return float(np.abs(delta).max())
+        """max |dx| over the units; see :class:`~srm_mbs.dynamics.system.System`."""
+        return float((np.abs(delta) / self._unit).max())
 
     def reachable(self, start: FloatArray, end: FloatArray) -> bool:
         """True: there is one chart."""
@@ -539,7 +553,7 @@ class DaeSystem:
         """max |g| over the typical row of G and the size of x: a relative error of x."""
         g = self.call("g", t, state)
         return float(np.max(np.abs(g) / self.projection.rows)) / max(
-            1.0, float(np.abs(state).max())
+            min(1.0, float(self._unit.max())), float(np.abs(state).max())
         )
 
     def damping(self, t: float, state: FloatArray) -> NDArray[np.complex128]:

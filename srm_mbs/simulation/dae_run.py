@@ -142,7 +142,8 @@ def run_dae(
     state, t0 = _start(x0), options.t0
     tolerance = _absolute_tolerance(options.atol, options.rtol, state.size)
     norm = ErrorNorm(tolerance, options.rtol, options.negligible)
-    system = DaeSystem(problem, t0, state, options.t_end, getattr(method, "T", "identity"))
+    T = getattr(method, "T", "identity")
+    system = DaeSystem(problem, t0, state, options.t_end, norm.one, T)
     _check_start(system, method, t0, state)
     log_start("DAE", options, norm, "python")
     watch = None
@@ -202,7 +203,8 @@ def _integrate(
             raise InputError(
                 f"G B is singular at the start, or almost (sigma = {memory.sigma:.1e})",
                 element="x0",
-                remedy="Start beside that point",
+                remedy="Start beside that point, or, where states are small, give an atol below "
+                f"rtol times their size ({options.rtol * float(np.abs(state).max()):.1g})",
             )
         first_sweeps = sweep_nodes(memory)
         record, wrappers = integrate_steps(system, options, norm, memory, state, watch, words=DAE)

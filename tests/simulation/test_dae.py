@@ -551,6 +551,39 @@ def test_derivatives_of_small_states_are_not_taken_for_wrong(size: float) -> Non
         srm.solve_dae(wrong, (0.0, 1.0), [0.0, size], rtol=1e-8, atol=1e-8 * size)
 
 
+def in_units(problem: srm.SemiExplicitDAE, size: float, span: float) -> srm.SemiExplicitDAE:
+    """``problem`` with states of the given ``size`` in times of ``span``."""
+    return srm.SemiExplicitDAE(
+        f=lambda t, x: size / span * problem.f(t / span, x / size),
+        B=lambda t, x: problem.B(t / span, x / size),
+        g=lambda t, x: problem.g(t / span, x / size),
+        G=lambda t, x: problem.G(t / span, x / size) / size,
+    )
+
+
+@pytest.mark.parametrize("tableau", ["dopr54", "rodas5p"])
+@pytest.mark.parametrize(("size", "span"), [(1e-12, 1.0), (1e-5, 1e9), (1e12, 1e-9)])
+def test_the_unit_of_the_states_does_not_change_the_steps(
+    size: float, span: float, tableau: str
+) -> None:
+    """With an atol in that unit."""
+    options: dict[str, Any] = {"tableau": tableau, "rtol": 1e-6}
+    usual = srm.solve_dae(passing_singularity(), (0.0, 3.0), START_PASSING, **options)
+    problem = in_units(passing_singularity(), size, span)
+    run = srm.solve_dae(
+        problem, (0.0, 3.0 * span), START_PASSING * size, atol=1e-6 * size, **options
+    )
+    assert run.success, run.message
+    assert run.stats.steps == usual.stats.steps
+    assert run.x[-1] / size == pytest.approx(solution_passing(3.0), abs=1e-5)
+
+
+def test_states_far_below_the_absolute_tolerance_are_refused_with_the_remedy() -> None:
+    problem = in_units(passing_singularity(), 1e-9, 1.0)
+    with pytest.raises(srm.InputError, match="give an atol below rtol times their size"):
+        srm.solve_dae(problem, (0.0, 1.0), START_PASSING * 1e-9)
+
+
 @pytest.mark.parametrize("t_end", [10.0, 1e4, 1e5])
 def test_a_fast_constraint_of_a_long_run_has_its_derivative(t_end: float) -> None:
     """x_0 = sin(30 t); the event ends the run, whose length decides how g_t is examined."""

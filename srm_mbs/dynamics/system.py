@@ -353,9 +353,15 @@ def onto_closures(system: System, t: float, state: FloatArray) -> FloatArray:
     """
     if not system.has_constraints:
         return state
+    before = np.inf
     for _ in range(MAX_NEWTON_STEPS):
-        correction = system.evaluate(t, state).correction()
+        terms = system.evaluate(t, state)
+        closed = terms.constraint_residual() < CLOSURE_TOLERANCE
+        correction = terms.correction()
         state = system.retract(state, -correction)
-        if system.position_norm(correction) < CLOSURE_TOLERANCE:
+        size = system.position_norm(correction)
+        # Next to a singular configuration steps end at the rounding of the closures over sigma.
+        if size < CLOSURE_TOLERANCE or (closed and size >= before):
             return state
+        before = size
     raise EvaluationError("no configuration that closes the loops was found near the one given")

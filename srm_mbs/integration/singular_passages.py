@@ -48,6 +48,7 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     participants,
 )
 from srm_mbs.dynamics.system import SingularityAnalysis, System
+from srm_mbs.errors import time_text
 from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
 from srm_mbs.integration.dense_output import CRITICAL, STEP_PLACEMENTS, DenseOutput, StepData
 from srm_mbs.integration.methods.butcher import SAME_STAGE, ButcherTableau
@@ -1315,15 +1316,16 @@ class Bifurcation:
         return self._crossing.arrived_on
 
     def __str__(self) -> str:
-        span = f"From t = {self.start:.6g} to {self.end:.6g} s the motion stayed"
-        moment = f"At t = {self.start:.6g} s the motion turned back"
+        span = f"From t = {time_text(self.start)} to {time_text(self.end)} s the motion stayed"
+        moment = f"At t = {time_text(self.start)} s the motion turned back"
         kept = "" if self.kept is None else f", number {self.kept}"
         did = "stopped there" if self.stopped else f"kept the one it came along{kept}"
+        number = f"{len(self.branches)} " if len(self.branches) else ""
         return (
             f"{span if self.end > self.start else moment} next to a singular "
             f"configuration of {self._crossing.participants} without the "
-            f"momentum to choose one of the {len(self.branches)} branches that meet there: the run "
-            f"{did} (solution.bifurcations)"
+            f"momentum to choose one of the {number}branches that meet there: the run {did} "
+            "(solution.bifurcations)"
         )
 
 

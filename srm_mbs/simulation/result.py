@@ -24,7 +24,7 @@ from srm_mbs.dynamics.point_motion import (
     point_positions,
     point_velocities,
 )
-from srm_mbs.errors import InputError, KnownKeys, safe_repr
+from srm_mbs.errors import InputError, KnownKeys, safe_repr, time_text
 from srm_mbs.integration.dense_output import (
     DenseOutput,
     StepData,
@@ -749,7 +749,7 @@ class SimulationResult(RunOutcome):
     def __repr__(self) -> str:
         first, last = (self.t[0], self.t[-1]) if len(self.t) else (0.0, 0.0)
         return (
-            f"Solution({self.mechanism.name!r}, t={first:.6g}..{last:.6g} s, "
+            f"Solution({self.mechanism.name!r}, t={time_text(first)}..{time_text(last)} s, "
             f"{len(self.t)} points, {self.stats.steps} steps, {self.status}, "
             f"{self.settings.backend})"
         )

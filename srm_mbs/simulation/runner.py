@@ -35,6 +35,7 @@ from srm_mbs.errors import (
     InputError,
     SimulationError,
     safe_repr,
+    time_text,
     warn,
 )
 from srm_mbs.integration import driver
@@ -846,7 +847,7 @@ def failed_start(t0: float, state: FloatArray, error: Exception, unit: str = "")
     record = RunRecord(t0, state.copy())
     record.status = RunStatus.FAILED
     record.error = error
-    record.message = f"Stopped at t = {t0:.6g}{unit}: {error}."
+    record.message = f"Stopped at t = {time_text(t0)}{unit}: {error}."
     return record
 
 

@@ -20,6 +20,7 @@ from srm_mbs.errors import (
     InputError,
     SimulationError,
     safe_repr,
+    time_text,
 )
 from srm_mbs.integration.breakpoints import smooth_intervals
 from srm_mbs.integration.generated.policy import charge, code_of_run
@@ -259,7 +260,7 @@ class Simulator:
         try:
             self._run.begin(t, state, force, dt, smooth_until)
         except EvaluationError as error:
-            raise SimulationError(f"Stopped at t = {t:.6g} s: {error}.", None) from error
+            raise SimulationError(f"Stopped at t = {time_text(t)} s: {error}.", None) from error
         self._pending_start = None
 
     def _charge(self) -> None:
@@ -340,6 +341,8 @@ class Simulator:
         mechanism = self._mechanism
         t = finite(t, "t")
         if q is None and v is None and not project:
+            if mechanism.drives:
+                check_consistent(mechanism, t, names=STATE_ARGUMENTS)
             state = mechanism.start_state
         else:
             q = mechanism.q0 if q is None else q
@@ -415,12 +418,14 @@ class Simulator:
         )
 
     def __repr__(self) -> str:
-        return f"Simulator({self._mechanism.name!r}, t={self.t:.6g} s)"
+        return f"Simulator({self._mechanism.name!r}, t={time_text(self.t)} s)"
 
 
 def _failed(t: float, cause: FailureCause) -> SimulationError:
     """The error of a step that failed at ``t`` (s) by ``cause``."""
-    return SimulationError(f"Stopped at t = {t:.6g} s: {cause.clause}. {cause.remedy}.", None)
+    return SimulationError(
+        f"Stopped at t = {time_text(t)} s: {cause.clause}. {cause.remedy}.", None
+    )
 
 
 def _bad_force(tau: Any, size: int) -> InputError:

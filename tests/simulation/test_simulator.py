@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -298,6 +299,21 @@ def test_other_methods_run_on_the_reference(slider_crank: srm.Mechanism) -> None
         simulator.step(0.01)
     exact = srm.simulate(slider_crank, 0.1, rtol=1e-10)
     assert np.abs(simulator.q - exact.q[-1]).max() < 1e-5
+
+
+def test_a_reset_to_another_time_needs_a_state_that_follows_the_drives() -> None:
+    four_bar = srm.load("four_bar")
+    driven = replace(four_bar, drives=(srm.Drive(srm.ConstantSpeed(6.0), "crank"),))
+    start = srm.assemble(driven, driven.q0)
+    driven = driven.with_state(start.q, start.v)
+    run = srm.simulate(driven, 0.7, rtol=1e-10)
+    simulator = srm.Simulator(driven, rtol=1e-10)
+
+    with pytest.raises(srm.InputError, match="violates the drives: row crank"):
+        simulator.reset(t=1e-3)
+    simulator.reset(*run(0.4), t=0.4)
+
+    np.testing.assert_allclose(simulator.step(0.3)[0], run.q[-1], rtol=0.0, atol=1e-9)
 
 
 def test_joints_of_many_degrees_are_stepped() -> None:

@@ -107,7 +107,8 @@ namespace srm {
     /* Critical configurations: singularities/critical.py, critical_passages.py. */                \
     field(int, critical_iterations)                                                                \
     field(double, critical_difference)     /* step of the differences of G^T u (units) */          \
-    field(double, critical_accepted)       /* size of the equations: the residual is known */      \
+    field(double, critical_decided)        /* size of the equations: a zero residual is known */   \
+    field(double, critical_accepted)       /* that from which the search has failed */             \
     field(double, critical_converged)      /* and that at rounding */                              \
     field(double, critical_frozen)         /* step up to which the Hessian is kept (units) */      \
     field(double, critical_ridge)          /* added to the Hessian's diagonal */                   \

@@ -233,8 +233,10 @@ Stop Run::attempt(StepDecision& decision) {
         const bool due = !known_ && zero > t_ && memory.sigma < examine_below_;
         if (due && (one_freedom_ || !quiet_) && examine(zero)) return make_prepared();
     }
+    // The end of the run, or of an interval, may be as close as that.
     const double spacing = std::nextafter(std::abs(t_), infinity) - std::abs(t_);
-    if (!(h > std::max(smallest_, 4.0 * spacing))) return Stop::too_short;
+    if (!(h > std::max(smallest_, 4.0 * spacing)) && proposal.t_new != intervals_.ends[interval_])
+        return Stop::too_short;
     const int steps = constants().standstill_steps;
     if (made_ >= steps && made_ % steps == 0 &&
         t_ - watched_time_ < constants().standstill * (t_end() - t0_))

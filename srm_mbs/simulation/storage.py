@@ -335,7 +335,7 @@ def load_result(path: Path, types: ResultTypes[R], reach: Reach) -> R:
         If the file is missing, is no saved run, is of another format, or unpacks to more than
         :mod:`srm_mbs.formats.archive` allows.
     """
-    with _naming(str(path)), open_regular(path, LARGEST_CONTENT) as file:
+    with _naming(str(path)), open_regular(path, LARGEST_CONTENT, SAVED_BY) as file:
         return load_from(file, path, types, reach)
 
 

@@ -366,8 +366,10 @@ def _naming(name: str) -> Iterator[None]:
 
 def _check_format(what: str, found: Any, known: tuple[int, ...]) -> None:
     if type(found) is not int or found not in known:
+        readable = " and ".join(map(str, sorted(known)))
         raise InputError(
-            f"{what} format {str(found)[:20]}, this version reads {known[0]}", remedy=OTHER_VERSION
+            f"{what} format {str(found)[:20]}, this version reads {readable}",
+            remedy=OTHER_VERSION,
         )
 
 

@@ -173,8 +173,9 @@ class EventFunction:
         except Exception as error:
             self.fail(error, t)
         if value.size != 1 or not np.isfinite(value).all():
+            given = None if found is None else value.tolist()
             raise EventError(
-                f"the event {self.name} returned {value.tolist()} at t = {time_text(t)} s; "
+                f"the event {self.name} returned {given} at t = {time_text(t)} s; "
                 "it must return one finite number",
                 t,
             )

@@ -666,7 +666,10 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
     try:
         run = _compiled_run(problem, kernel_system, first, given, handler)
     except ArithmeticError:  # the reference raises the error that says why
-        first_step = chosen_first_step(evaluator, norm, options, state_from(first), state)
+        known = state_from(first)
+        first_step = chosen_first_step(
+            evaluator, norm, options, known, state, smooth_until=handler.end
+        )
         run = _compiled_run(problem, kernel_system, first, first_step, handler)
     with progress_of(options.progress, system, options.t_end) as tick:
         record = kernel_driver.integrate(
@@ -729,7 +732,15 @@ def integrate_steps(
     control, wrappers = placed_control(
         system,
         options,
-        lambda: chosen_first_step(system, norm, options, memory, state, last_step),
+        lambda: chosen_first_step(
+            system,
+            norm,
+            options,
+            memory,
+            state,
+            last_step,
+            np.inf if handler is None else handler.end,
+        ),
         handler is not None and handler.arrivals,
     )
     with progress_of(options.progress, system, options.t_end) as tick:
@@ -760,14 +771,18 @@ def chosen_first_step(
     memory: IntegratorState,
     state: FloatArray,
     last_step: float = 0.0,
+    smooth_until: float = np.inf,
 ) -> float:
     """The given first step (s), the ``last_step`` of the segment before, if there is one with the
-    same equations, or the step that the start of the run allows."""
+    same equations, or the step that the start of the run allows, which is smooth until
+    ``smooth_until`` (s)."""
     if options.first_step is not None:
         return float(options.first_step)
     order = options.method.scheme.controller_order or 1
     span, t0 = options.t_end - options.t0, options.t0
-    return last_step or initial_step(evaluator, state, memory, norm, span, order, t0)
+    return last_step or initial_step(
+        evaluator, state, memory, norm, span, order, t0, smooth_until - t0
+    )
 
 
 def failed_start(t0: float, state: FloatArray, error: Exception, unit: str = "") -> RunRecord:

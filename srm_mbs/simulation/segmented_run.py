@@ -36,11 +36,11 @@ from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
 from srm_mbs.model.numbers import positive_number
 from srm_mbs.model.validation import STATE_ARGUMENTS
+from srm_mbs.simulation.consistency import check_consistent
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.runner import (
     Segment,
-    check_consistent,
     checked_options,
     finished,
     initial_state,

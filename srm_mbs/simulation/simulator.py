@@ -31,6 +31,7 @@ from srm_mbs.integration.methods.branch_nodes import onto_closed_branch
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.numbers import positive_number, real_array
 from srm_mbs.model.validation import STATE_ARGUMENTS
+from srm_mbs.simulation.consistency import check_consistent
 from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
 from srm_mbs.simulation.incremental_run import IncrementalRun, KernelRun, ReferenceRun
 from srm_mbs.simulation.options import (
@@ -42,7 +43,6 @@ from srm_mbs.simulation.options import (
 from srm_mbs.simulation.result import Statistics
 from srm_mbs.simulation.runner import (
     above_rounding,
-    check_consistent,
     checked_accuracy,
     error_norm,
 )

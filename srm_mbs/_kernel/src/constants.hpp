@@ -76,6 +76,9 @@ namespace srm {
     field(double, first_step_probe)        /* relative change that the first step may make */      \
     field(double, longest_first_step)      /* over the probing step */                             \
     field(double, at_rest)                 /* change of rates at rest, over the probing step */    \
+    field(double, rest_probe_late)         /* parts of the interval at which */                    \
+    field(double, rest_probe_early)        /* the end of a rest shows */                           \
+    field(double, rest_ends)               /* change of the rates there */                         \
     field(double, rest_factor)             /* of the times at which its end is looked for */       \
     field(double, clock_rounding)          /* of the end of a step, over its length, that counts */ \
     /* Placement: control/placement.py. */                                                         \

@@ -46,7 +46,8 @@ double ErrorNorm::ratio(const double* error, const double* weights, int n) {
 // tolerance.
 double initial_step(System& system, const ErrorNorm& norm, double t, const double* state,
                     const double* rate, const double* state_scale, double span, int order,
-                    const Constants& constants) {
+                    const Constants& constants, double smooth) {
+    smooth = std::min(smooth, span);
     const int n = 2 * system.nv;
     std::vector<double> weights(n), error(n), there(n), probed(n), x(system.nq + system.nv);
     for (int i = 0; i < n; ++i) {
@@ -58,8 +59,8 @@ double initial_step(System& system, const ErrorNorm& norm, double t, const doubl
         throw EvaluationError{Failure::not_finite};
     const double d1 = ErrorNorm::ratio(rate, weights.data(), n);
     if (!std::isfinite(d1)) throw EvaluationError{Failure::not_finite};
-    if (!(d1 > 0.0)) return constants.first_step_probe * span;
-    const double h0 = std::min(constants.first_step_probe * d0 / d1, span);
+    if (!(d1 > 0.0)) return constants.first_step_probe * smooth;
+    double h0 = std::min(constants.first_step_probe * d0 / d1, span);
     // Size of the change of the rates over `ahead` (s), with the state moving on or not.
     const auto change = [&](double ahead, double moves) {
         for (int i = 0; i < n; ++i) error[i] = moves * ahead * rate[i];
@@ -70,9 +71,19 @@ double initial_step(System& system, const ErrorNorm& norm, double t, const doubl
         for (int i = 0; i < n; ++i) probed[i] -= rate[i];
         return ErrorNorm::ratio(probed.data(), weights.data(), n);
     };
-    const double d2 = change(h0, 1.0) / h0;
+    double d2 = change(h0, 1.0) / h0;
     if (!std::isfinite(d2)) throw EvaluationError{Failure::not_finite};
     const double longest = constants.longest_first_step * h0;
+    if (h0 == span) {
+        // A drive that moves smoothly from rest to rest has the rates of its start at its end.
+        for (const double part : {constants.rest_probe_late, constants.rest_probe_early}) {
+            const double ahead = part * smooth, changed = change(ahead, 0.0);
+            if (changed > constants.rest_ends * d2 * h0) {
+                h0 = ahead;
+                d2 = changed / ahead;
+            }
+        }
+    }
     if (!(d2 > 0.0)) return std::min(longest, span);
     double tau = d1 / d2, faster = d1;
     if (tau < constants.at_rest * h0 && change(h0, 0.0) > 0.5 * h0 * d2) {

@@ -137,6 +137,9 @@ def constants() -> Any:
         first_step_probe=step_size.PROBE_LENGTH,
         longest_first_step=step_size.LONGEST_FIRST,
         at_rest=step_size.AT_REST,
+        rest_probe_late=step_size.REST_PROBES[0],
+        rest_probe_early=step_size.REST_PROBES[1],
+        rest_ends=step_size.REST_ENDS,
         rest_factor=step_size.REST_FACTOR,
         clock_rounding=step_size.CLOCK_ROUNDING,
         # Placement.

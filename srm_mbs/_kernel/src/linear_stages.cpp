@@ -294,7 +294,7 @@ void LinearStages::solve(double* x, const double* laws, const double* applied,
         }
     }
     for (int k = 0; k < m; ++k) law_rates[k] = (laws[k] - applied[k]) / k_;
-    for (int j = 0; j < n_; ++j) add(x[j], &L_[j * m], law_rates, m);
+    for (int j = 0; j < n_; ++j) add(x[j], L_.data() + j * m, law_rates, m);
 }
 
 void LinearStages::multiply(const std::vector<double>& x, std::vector<double>& out) const {

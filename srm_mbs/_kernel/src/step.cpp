@@ -160,7 +160,7 @@ void SplitStep::apply_laws(int j) {
     applied_ = linear_->applied();
     const double* a = j < s ? &scheme.A[j * s] : scheme.b.data();
     for (int k = scheme.lead; k < j; ++k)
-        if (a[k] != 0.0) add(h_ * a[k], &law_rates_[k * m], applied_.data(), m);
+        if (a[k] != 0.0) add(h_ * a[k], law_rates_.data() + k * m, applied_.data(), m);
     system_.apply_laws(j < s && m ? applied_.data() : nullptr);
 }
 
@@ -168,14 +168,14 @@ void SplitStep::apply_laws(int j) {
 // laws there.
 void SplitStep::linear_rate(int j, const std::vector<double>& laws) {
     const int s = scheme.stages(), n = n_, m = linear_->count();
-    double *const rate = &result.rates[j * n], *const law_rate = &law_rates_[j * m];
+    double *const rate = &result.rates[j * n], *const law_rate = law_rates_.data() + j * m;
     const double* by_time = linear_->by_time().data();
     std::fill(error_.begin(), error_.end(), 0.0);
     std::fill(law_shares_.begin(), law_shares_.end(), 0.0);
     for (int k = scheme.lead; k < j; ++k) {
         const double weight = linear_weights_[j * s + k];
         add(weight, &result.rates[k * n], error_.data(), n);
-        add(weight, &law_rates_[k * m], law_shares_.data(), m);
+        add(weight, law_rates_.data() + k * m, law_shares_.data(), m);
     }
     const double share = h_ * time_shares_[j];
     for (int i = 0; i < n; ++i) rate[i] += error_[i] + share * by_time[i];

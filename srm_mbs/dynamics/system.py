@@ -326,6 +326,10 @@ class BranchSystem(System, Protocol):
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> BranchTerms:
         """As :meth:`System.evaluate`."""
 
+    def joined_laws(self) -> tuple[FloatArray, FloatArray] | None:
+        """At the stage evaluated last, the forces F (nv,) of laws of which the system takes what
+        closures leave, and M^-1 F; None if it takes them as they are."""
+
     def working_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Generalised forces (nv,) that do work: all but those of inertia and of closures."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from dataclasses import replace
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,37 @@ from tests.support.backends import needs_kernel, on_both
 from tests.support.mechanisms import floating_ring
 from tests.support.memory import ON_LINUX, growth
 from tests.support.snapshots import check_messages, refused
+
+
+@on_both
+def test_two_threads_do_not_use_one_simulator_at_once(backend: str) -> None:
+    inside, go_on = Event(), Event()
+
+    def wait(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        if t > 0.0:
+            inside.set()
+            go_on.wait(10.0)
+        return np.zeros(3)
+
+    mechanism = replace(srm.load("four_bar"), forces=(srm.UserForce(wait, name="wait"),))
+    simulator = srm.Simulator(mechanism, backend=backend)
+    thread = Thread(target=simulator.step, args=(0.1,))
+    thread.start()
+    assert inside.wait(10.0)
+    for call in (
+        lambda: simulator.step(0.1),
+        simulator.reset,
+        simulator.set_state,
+        simulator.clone,
+    ):
+        with pytest.raises(srm.InputError, match="another thread uses this simulator"):
+            call()
+    go_on.set()
+    thread.join()
+    alone = srm.Simulator(mechanism, backend=backend)
+    alone.step(0.1)
+    np.testing.assert_array_equal(simulator.q, alone.q)
+    assert simulator.clone().t == simulator.t
 
 
 @pytest.fixture(scope="module")

@@ -61,6 +61,8 @@ namespace srm {
     field(double, layer_approached)        /* rate of steps whose stages miss one, over the first */ \
     field(double, layer_unresolved)        /* change of a rate that misses one (layers) */         \
     field(double, difference)              /* by a coordinate, over its size */                    \
+    field(double, central_difference)      /* the same, central */                                 \
+    field(double, friction_difference)     /* of a rate, over the speed of friction, at most */    \
     field(double, time_difference)         /* by time, over the step */                            \
     field(double, shortest_difference)     /* by time (roundings of t) */                          \
     /* Step-size control: control/step_size.py. */                                                 \

@@ -171,7 +171,7 @@ void SplitStep::apply_laws(int j) {
     applied_ = linear_->applied();
     const double* a = j < s ? &scheme.A[j * s] : scheme.b.data();
     for (int k = scheme.lead; k < j; ++k)
-        if (a[k] != 0.0) add(h_ * a[k], &law_rates_[k * m], applied_.data(), m);
+        if (a[k] != 0.0) add(h_ * a[k], law_rates_.data() + k * m, applied_.data(), m);
     system_.apply_laws(j < s && m ? applied_.data() : nullptr);
 }
 
@@ -179,14 +179,14 @@ void SplitStep::apply_laws(int j) {
 // laws there.
 void SplitStep::linear_rate(int j, const std::vector<double>& laws) {
     const int s = scheme.stages(), n = n_, m = linear_->count();
-    double *const rate = &result.rates[j * n], *const law_rate = &law_rates_[j * m];
+    double *const rate = &result.rates[j * n], *const law_rate = law_rates_.data() + j * m;
     const double* by_time = linear_->by_time().data();
     std::fill(error_.begin(), error_.end(), 0.0);
     std::fill(law_shares_.begin(), law_shares_.end(), 0.0);
     for (int k = scheme.lead; k < j; ++k) {
         const double weight = linear_weights_[j * s + k];
         add(weight, &result.rates[k * n], error_.data(), n);
-        add(weight, &law_rates_[k * m], law_shares_.data(), m);
+        add(weight, law_rates_.data() + k * m, law_shares_.data(), m);
     }
     const double share = h_ * time_shares_[j];
     for (int i = 0; i < n; ++i) rate[i] += error_[i] + share * by_time[i];
@@ -370,13 +370,14 @@ bool SplitStep::solve_on_branch(double t, double start, const double* state,
         known = !away_.empty();
         if (!known) nodes_->find_direction(start, state, away_);
         touches_ = away_.size() > static_cast<std::size_t>(nv_);
-        if (touches_) {
+        if (touches_ && !linear_) {
             if (!touching_) touching_.emplace(system_, constants);
             found = touching_->prepare(start, state, away_);
         }
         if (touches_ || !known) system_.evaluate(t, x_.data(), System::ZoneView{});
     }
-    if (away_.empty() || !found)
+    // Linearly implicit steps have no nodes where branches touch.
+    if (away_.empty() || !found || (touches_ && linear_))
         found = false;
     else if (touches_)
         found = touching_->solve(t, x_.data(), *nodes_);
@@ -458,7 +459,7 @@ const StepResult& SplitStep::make(double t, double h, const double* state,
     h_ = h;
     monitored_ = constrained && memory.sigma < constants.monitored_below +
                                                    constants.far_steps * sigma_change;
-    lingers_ = monitored_ && memory.lingering && theta == 1.0 && !linear_;
+    lingers_ = monitored_ && memory.lingering && theta == 1.0;
     r.stiff = memory.stiff;
     if (monitored_) {
         for (int i = 0; i < n_; ++i) weights_[i] = norm.weight(i, memory.state_scale[i]);
@@ -504,9 +505,17 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
         }
     };
     const Tracking tracking(linear_ ? &system_ : nullptr);
+    noded_ = noded_end_ = r.lost_branch = false;
+    if (lingers_) away_.clear();
     if (linear_) {
-        linear_->prepare(t, h_, state, memory.rate, memory.state_scale, memory.laws,
-                         monitored_ ? branch_.zone : none, monitored_ && branch_.near);
+        LinearStages::Places places;
+        if (monitored_) places = {branch_.zone, branch_.near, {}};
+        if (lingers_)
+            places.by_nodes = [&](double time, const double* x) -> const StageOnBranch* {
+                std::copy_n(x, nx_, x_.begin());
+                return solve_on_branch(time, t, state, memory) ? &*nodes_ : nullptr;
+            };
+        linear_->prepare(t, h_, state, memory.rate, memory.state_scale, memory.laws, places);
         for (int j = 0; j <= scheme.lead; ++j) {
             std::copy_n(linear_->rate().begin(), n, &r.rates[j * n]);
             r.sigmas[j] = memory.sigma;
@@ -518,8 +527,6 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
     r.rank = std::numeric_limits<int>::max();
     r.held = false;
     moved_end_ = false;
-    noded_ = noded_end_ = r.lost_branch = false;
-    if (lingers_) away_.clear();
     for (int j = scheme.lead + 1; j <= s; ++j) {
         const bool end = j == s;
         const double* a = end ? scheme.b.data() : &scheme.A[j * s];
@@ -540,6 +547,7 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
                 x_ = nodes_->state;
                 rate_ = nodes_->rate;
                 system_.chart_rate(delta_.data(), rate_.data(), &r.rates[j * n]);
+                if (linear_ && !end) linear_rate(j, nodes_->laws);
                 continue;
             }
             system_.evaluate(time, x_.data(), branch_.zone);

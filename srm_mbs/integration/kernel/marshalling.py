@@ -122,6 +122,8 @@ def constants() -> Any:
         layer_approached=reversals.APPROACHED,
         layer_unresolved=reversals.UNRESOLVED,
         difference=linear_split_step.DIFFERENCE,
+        central_difference=linear_split_step.CENTRAL_DIFFERENCE,
+        friction_difference=linear_split_step.FRICTION_DIFFERENCE,
         time_difference=linear_split_step.TIME_DIFFERENCE,
         shortest_difference=linear_split_step.SHORTEST_DIFFERENCE,
         # Step-size control.

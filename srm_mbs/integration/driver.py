@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,7 +15,12 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
 from srm_mbs.errors import ControllerError, EvaluationError, EventError, safe_repr, time_text
 from srm_mbs.integration.breakpoints import BreakpointHandler
-from srm_mbs.integration.control.step_size import Proposal, StepDecision, StepSizeControl
+from srm_mbs.integration.control.step_size import (
+    Proposal,
+    StepDecision,
+    StepSizeControl,
+    longest_from_rest,
+)
 from srm_mbs.integration.critical_passages import CriticalPassages
 from srm_mbs.integration.dense_output import StepData, step_data
 from srm_mbs.integration.events import EventWatch, Stop, step_dense
@@ -354,13 +360,15 @@ def integrate(
     unevaluated: RunFailure | None = None
     redone = False
     jump = JumpSearch(system, norm)
+    rest_limit = math.inf
     if breakpoints is not None:
         control.set_target_time(breakpoints.end)
 
     def accept(result: StepResult, t_new: float) -> bool:
         """Move to the end of a step; whether a terminal event ends the run there."""
-        nonlocal t, x
+        nonlocal t, x, rest_limit
         method.accept(memory, result)
+        rest_limit = math.inf
         start, t, x = x, t_new, result.state
         record.times.append(t)
         record.steps.append(result)
@@ -409,11 +417,12 @@ def integrate(
                 on_curve = passages is not None and passages.under_way
                 memory = breakpoints.next(t, x, memory, evaluated=not on_curve)
                 control.set_target_time(breakpoints.end)
+                rest_limit = longest_from_rest(system, memory, norm, breakpoints.end - t)
             if passages is not None and passages.under_way:
                 if not pass_critical(None):
                     memory = restarted()
                 continue
-            limit = min(max_step, system.step_limit(x), jump.limit)
+            limit = min(max_step, system.step_limit(x), jump.limit, rest_limit)
             proposal = control.propose(t, limit, memory)
             if proposal.singular_arrival and breakpoints is not None:
                 memory = breakpoints.singular_arrival(t, x, memory)

@@ -364,6 +364,22 @@ def initial_step(
     return float(min(longest, tau * (PROBE_LENGTH / (tau * d1)) ** (1.0 / order), span))
 
 
+def longest_from_rest(
+    system: System, memory: IntegratorState, norm: ErrorNorm, ahead: float
+) -> float:
+    """Longest step (s) from a breakpoint of a driven mechanism, in a smooth interval that goes on
+    for ``ahead`` (s): unbounded unless it rests.
+
+    A drive that leaves its rest smoothly may have, at the stages of a step over its whole motion,
+    the accelerations of the rest.
+    """
+    analysis = system.singularities
+    if analysis is None or not analysis.driven:
+        return math.inf
+    moved = ahead * norm(memory.rate, norm.weights(memory.state_scale))
+    return REST_PROBES[-1] * ahead if moved < norm.negligible else math.inf
+
+
 def _end_of_rest(
     change: Callable[[float], float], shortest: float, longest: float
 ) -> tuple[float, float]:

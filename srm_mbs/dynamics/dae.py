@@ -35,6 +35,16 @@ from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import real_array
 
 
+def _sizes(packed: FloatArray, pivots: FloatArray) -> FloatArray:
+    """Sizes (m,) of the directions of a matrix from its :func:`pivoted_qr`, falling: continuous
+    functions of the matrix, as the last of more than two ``pivots`` is not, which jumps where
+    others change places."""
+    m = len(pivots)
+    if m <= 2:
+        return pivots
+    return np.linalg.svd(np.triu(packed[:m]), compute_uv=False).astype(np.float64, copy=False)
+
+
 class ObliqueProjection:
     """Factorisation of G and B at one point; reused.
 
@@ -50,7 +60,8 @@ class ObliqueProjection:
     factorisations
         How many factorisations were done.
     sizes : (3,)
-        The last pivot of the scaled G^T, that of the scaled B, and the smallest cosine in C.
+        The smallest singular value of the scaled G^T, that of the scaled B, and the smallest
+        cosine in C.  Of up to two rows, the last pivot takes the place of the singular value.
     sigma
         The smallest of these three numbers over its reference.
     rank, rank_deficient
@@ -77,10 +88,11 @@ class ObliqueProjection:
         self.factorisations += 1
         if not (np.isfinite(G).all() and np.isfinite(B).all()):
             raise EvaluationError("G or B is not finite")
-        packed, order, tau, g_pivots = pivoted_qr((G / self.rows[:, None]).T)
-        packed_b, _, tau_b, b_pivots = pivoted_qr(B / self.columns)
+        packed, order, tau, pivots = pivoted_qr((G / self.rows[:, None]).T)
+        packed_b, _, tau_b, pivots_b = pivoted_qr(B / self.columns)
+        g_sizes, b_sizes = _sizes(packed, pivots), _sizes(packed_b, pivots_b)
         floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold)
-        used = (g_pivots > floor * self.reference[0]) & (b_pivots > floor * self.reference[1])
+        used = (g_sizes > floor * self.reference[0]) & (b_sizes > floor * self.reference[1])
         rank = int(np.flatnonzero(used).max(initial=-1)) + 1
         self.rank, self.rank_deficient = rank, rank < len(G)
         self.order = order[:rank]
@@ -94,7 +106,7 @@ class ObliqueProjection:
                 "G B is singular though neither G nor B loses rank: x' does not stay bounded there"
             )
         self.inverse: FloatArray = (right.T / cosines) @ left.T
-        self.sizes = np.array([g_pivots[-1], b_pivots[-1], cosine])
+        self.sizes = np.array([g_sizes[-1], b_sizes[-1], cosine])
         self.sigma = float((self.sizes / self.reference).min())
 
     def lift(self, residual: FloatArray) -> FloatArray:
@@ -261,6 +273,7 @@ class DaeSystem:
     """
 
     has_constraints = True
+    sigma_scatters = False
     time_dependent = True
     laws = np.zeros(0)
     singularities = None
@@ -280,8 +293,6 @@ class DaeSystem:
         self.nx = len(x0)
         self._unit = np.maximum(1.0, np.abs(x0))
         self.ny = self._count_rows(t0, x0)
-        # The last of three or more pivots jumps where others are taken.
-        self.sigma_scatters = self.ny > 2
         self.shapes = {
             "f": (self.nx,),
             "B": (self.nx, self.ny),

@@ -185,8 +185,7 @@ class System(Protocol):
     predicts: bool
     """Whether the exact multiplier is known: False for a DAE whose g_t is needed and not given."""
     sigma_scatters: bool
-    """Whether sigma jumps when other pivots are taken, along the graph of many loops or among the
-    rows of a DAE."""
+    """Whether sigma jumps when other pivots are taken, along the graph of many loops."""
 
     @property
     def wraps(self) -> bool:

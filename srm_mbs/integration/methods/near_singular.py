@@ -43,6 +43,10 @@ NEAR_STEPS = 4.0
 """Steps that start with sigma below NEAR_STEPS |d sigma / dt| h are next to a singular
 configuration; of sweeps, which keep their constraint errors for about eps, those with sigma below
 NEAR_STEPS |d sigma / dt| max(h, eps)."""
+FIRST_ORDER_SIGMA = 0.3
+"""sigma below which every step of a system of first order is next to a singular configuration.  A
+stage off the branch by c h^2 has a rate that errs by c h^2 |d sigma / dt|/sigma: a scheme of the
+order p loses h^(p + 1)/sigma^(p - 1) in a step: over the steps from NEAR_STEPS on, h^2 in all."""
 FAR_STEPS = 8.0
 """Distance from a singular configuration, in steps, from which a step prepares nothing for one."""
 MAX_PROJECTIONS = 4
@@ -156,7 +160,8 @@ class BranchStages:
 
     def reach(self) -> float:
         """sigma below which the step is next to a singular configuration."""
-        return NEAR_STEPS * self.sigma_change if self.sigma_change > 0.0 else WATCHED_SIGMA
+        near = NEAR_STEPS * self.sigma_change if self.sigma_change > 0.0 else WATCHED_SIGMA
+        return near if self.system.multiplier_part.start else max(near, FIRST_ORDER_SIGMA)
 
     def __call__(
         self, terms: Terms, t: float, c: float, x: FloatArray

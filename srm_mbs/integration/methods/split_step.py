@@ -32,6 +32,7 @@ from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
 from srm_mbs.integration.methods.near_singular import (
     FAR_STEPS,
+    FIRST_ORDER_SIGMA,
     UNCERTAINTY_SIGMA_CHANGE,
     WATCHED_SIGMA,
     BranchStages,
@@ -142,7 +143,8 @@ class SplitStep:
         branch: BranchStages | None = None
         nodes: StageNodes | None = None
         zone = None
-        if history is not None and start < WATCHED_SIGMA + FAR_STEPS * sigma_change:
+        watched = WATCHED_SIGMA if system.multiplier_part.start else FIRST_ORDER_SIGMA
+        if history is not None and start < watched + FAR_STEPS * sigma_change:
             weights = norm.weights(memory.state_scale)
             branch_system = system.branch_system
             if memory.lingering and self.uses_nodes and branch_system is not None:
@@ -190,7 +192,7 @@ class SplitStep:
             if terms.rank_deficient:
                 deficient.append((j, terms.rank, terms.held))
         change = abs(sigma - start)
-        quiet = branch is None and sigma > WATCHED_SIGMA + FAR_STEPS * change
+        quiet = branch is None and sigma > watched + FAR_STEPS * change
         state_scale = system.state_scale(x)
 
         # Correction at the end.
@@ -236,7 +238,8 @@ class SplitStep:
         result.error_ratio = self._error_ratio(
             system, memory, norm, result, branch, deficient, direct_from
         )
-        last_motion = delta - before if branch is None else None
+        tells = branch is None or start >= WATCHED_SIGMA + FAR_STEPS * sigma_change
+        last_motion = delta - before if tells else None
         result.stiffness = self._stiffness(system, memory, norm, result, last_motion)
         due = memory.steps < RESIDUAL_EVERY or memory.steps % RESIDUAL_EVERY == 0
         if due and history is not None and theta == 1.0 and away is None:

@@ -96,6 +96,11 @@ def joined_names(names: Iterable[str]) -> str:
     return f"{listed} and {more} more" if more > 0 else listed
 
 
+def time_text(t: float) -> str:
+    """A time (s) for a message: six digits, and of 1000 s and more three after the point."""
+    return f"{t:.6g}" if abs(t) < 1000.0 else f"{round(t, 3):.15g}"
+
+
 def counted(count: int, noun: str) -> str:
     """``1 degree``, ``2 degrees``: a ``noun`` with a regular plural."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -20,7 +20,7 @@ from srm_mbs.assembly.assemble import Assembly, assemble
 from srm_mbs.assembly.position import ClosureProblem, close_positions, onto_singular_point
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
-from srm_mbs.errors import InputError, counted, get_logger, safe_repr
+from srm_mbs.errors import InputError, counted, get_logger, naming, safe_repr
 from srm_mbs.model.coordinates import coordinate_names, free_coordinates, set_position
 from srm_mbs.model.numbers import name_list, named_values, positive_integer
 
@@ -150,7 +150,8 @@ def assembly_modes(
         )
     start = np.array(mechanism.q0)
     for name, value in positions.items():
-        set_position(mechanism, start, name, value)
+        with naming(element="q"):
+            set_position(mechanism, start, name, value)
     problem = ClosureProblem(mechanism, start)
     if q is None and hold is None:
         held = tuple(_joints_to_hold(mechanism, problem, start))

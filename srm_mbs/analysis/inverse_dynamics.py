@@ -25,7 +25,7 @@ from srm_mbs.dynamics.constraints.reactions import Reactions, reactions_at
 from srm_mbs.dynamics.constraints.structure import structure_of
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
-from srm_mbs.errors import InputError, counted
+from srm_mbs.errors import InputError, counted, time_text
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import positive_number
@@ -200,7 +200,7 @@ def inverse_dynamics(
         basis, _ = tangent_basis(geometry, q[i], np.arange(nv))
         if basis.shape[1] != free:
             raise InputError(
-                f"at t = {time:.6g} s the motion is on a singular configuration, where the "
+                f"at t = {time_text(time)} s the motion is on a singular configuration, where the "
                 "forces of the actuators are not determined",
                 element="motion",
                 remedy="Leave this time out",
@@ -219,7 +219,7 @@ def inverse_dynamics(
         worst = int(np.argmax(residual))
         raise InputError(
             f"{', '.join(labels[j] for j in columns)} cannot drive this motion of "
-            f"{counted(free, 'degree')} of freedom: at t = {times[worst]:.6g} s "
+            f"{counted(free, 'degree')} of freedom: at t = {time_text(times[worst])} s "
             f"{residual[worst]:.1e} of the largest force is missing",
             element="actuated",
             remedy="Name more joints",
@@ -255,7 +255,7 @@ def _check_motion(
         worst = float(np.abs(error).max(initial=0.0))
         if worst > tolerance * size:
             raise InputError(
-                f"at t = {time:.6g} s the {what} of the motion violate the closures by "
+                f"at t = {time_text(time)} s the {what} of the motion violate the closures by "
                 f"{worst / size if size else worst:.1e}",
                 element="motion",
                 remedy="Close positions and rates with srm.assemble, or simulate a motion",

@@ -27,7 +27,7 @@ from srm_mbs.dynamics.forces import friction_sums, resolved_forces
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.singularities.local_analysis import TAU
-from srm_mbs.errors import InputError, counted, get_logger, safe_repr
+from srm_mbs.errors import InputError, counted, get_logger, naming, safe_repr
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import finite_number, positive_integer, positive_number
@@ -201,7 +201,8 @@ def _chosen(mechanism: Mechanism, basis: FloatArray, names: Iterable[str] | None
         from scipy.linalg import qr
 
         return np.sort(qr(basis.T, mode="r", pivoting=True)[1][:k])
-    chosen = joint_coordinates(mechanism, names)
+    with naming(element="coordinates"):
+        chosen = joint_coordinates(mechanism, names)
     smallest = (
         np.linalg.svd(basis[chosen], compute_uv=False).min(initial=1.0) if len(chosen) == k else 0.0
     )
@@ -302,7 +303,8 @@ def linearise(
     scale = np.tile(unit[chosen], 2)
     A = differences(field, steps) * scale[:, None] / scale
     names = mechanism.joint_names if inputs is None else inputs
-    columns = joint_coordinates(mechanism, (names,) if isinstance(names, str) else names)
+    with naming(element="inputs"):
+        columns = joint_coordinates(mechanism, (names,) if isinstance(names, str) else names)
     drift = field(np.zeros(2 * k)) * scale
     # The factorisation at the state gives the response to forces.
     terms = system.evaluate(0.0, np.concatenate([q, v]))

@@ -16,6 +16,7 @@ from srm_mbs.analysis.time_constants import stiff_elements
 from srm_mbs.dynamics.constraints.rows import closure_errors
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import angle_coordinates, is_angle, row_angles, scene_diagonal
+from srm_mbs.errors import time_text
 from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
 from srm_mbs.integration.kernel.backend import backend, code_status
 from srm_mbs.model.anchors import Anchor
@@ -67,7 +68,7 @@ def run_rows(solution: SimulationResult, *, passages: bool = True) -> list[tuple
         ("mechanism", solution.mechanism.name),
         ("status", solution.status),
         ("computed by", BACKENDS[solution.settings.backend]),
-        ("end time", f"{solution.t[-1]:.6g} s"),
+        ("end time", f"{time_text(solution.t[-1])} s"),
         ("steps", f"{stats.steps}"),
         ("rejected steps", f"{stats.rejected}"),
         ("evaluations", f"{stats.evaluations}"),

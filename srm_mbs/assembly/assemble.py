@@ -103,8 +103,8 @@ class Assembly:
 
     q: FloatArray
     v: FloatArray
-    residuals: FloatArray
-    rate_residuals: FloatArray
+    residuals: FloatArray = field(repr=False)
+    rate_residuals: FloatArray = field(repr=False)
     free_directions: FloatArray = field(repr=False)
     singular: bool
 

@@ -106,7 +106,7 @@ def reported(command: Callable[Given, None]) -> Callable[Given, None]:
             raise typer.Exit(INTERRUPTED) from error
         except SrmError as error:
             if isinstance(error, InputError) and error.element is not None:
-                error.element = _as_written(error.element, command)
+                error.element = _as_written(error, error.element, command)
             say("error", error)
             raise typer.Exit(BAD_INPUT) from error
         except OSError as error:
@@ -136,8 +136,22 @@ def _warnings_as_lines() -> Iterator[None]:
         yield
 
 
-def _as_written(element: str, command: Callable[..., None]) -> str:
-    hint = get_type_hints(command, include_extras=True).get(element)
+OPTIONS_OF = {
+    "q": ("hold",),
+    "initial.q": ("q", "hold"),
+    "initial.v": ("v",),
+    "inputs": ("actuated",),
+    "coordinates": ("coordinate",),
+    "actuators": ("control",),
+}
+"""Parameters of commands whose values arrive in the element of an error, unless a file gave it."""
+
+
+def _as_written(error: InputError, element: str, command: Callable[..., None]) -> str:
+    """``element`` of ``error`` by the name of its option or argument of ``command``."""
+    hints = get_type_hints(command, include_extras=True)
+    names = (element, *(OPTIONS_OF.get(element, ()) if error.file is None else ()))
+    hint = next((hints[name] for name in names if name in hints), None)
     for given in getattr(hint, "__metadata__", ()):
         if isinstance(given, OptionInfo):
             # Within Annotated the first argument of typer.Option is its name, if any is given.

@@ -10,7 +10,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
-from srm_mbs.errors import ControllerError, InputError, known_names, safe_repr
+from srm_mbs.errors import ControllerError, InputError, known_names, safe_repr, time_text
 from srm_mbs.model.numbers import finite_array, named_values
 
 Controls = Mapping[str, Any]
@@ -72,7 +72,7 @@ class ActuatorController:
             except Exception as error:
                 raise ControllerError(
                     f"the control of the actuator {safe_repr(name)}, a function of t, raised "
-                    f"{safe_repr(error)} at t = {t:.6g} s",
+                    f"{safe_repr(error)} at t = {time_text(t)} s",
                     t,
                 ) from error
             out[at] = _control(name, value, t)
@@ -81,15 +81,15 @@ class ActuatorController:
         given = self._law(t, q, v)
         if not isinstance(given, Mapping):
             raise ControllerError(
-                f"the function of the controls returned {safe_repr(given)} at t = {t:.6g} s; it "
-                "must return a mapping of the names of actuators to numbers",
+                f"the function of the controls returned {safe_repr(given)} at t = {time_text(t)} "
+                "s; it must return a mapping of the names of actuators to numbers",
                 t,
             )
         for name, value in given.items():
             if not isinstance(name, str) or name not in self._names:
                 raise ControllerError(
                     f"the function of the controls names the actuator {safe_repr(name)} at "
-                    f"t = {t:.6g} s, which does not exist. {known_names(self._names)}",
+                    f"t = {time_text(t)} s, which does not exist. {known_names(self._names)}",
                     t,
                 )
             out[self._names.index(name)] = _control(name, value, t)
@@ -113,8 +113,8 @@ def _control(name: str, value: Any, t: float) -> float:
     number = finite_array(value, ())
     if number is None:
         raise ControllerError(
-            f"the control of the actuator {safe_repr(name)} is {safe_repr(value)} at t = {t:.6g} "
-            "s; it must be a finite number",
+            f"the control of the actuator {safe_repr(name)} is {safe_repr(value)} at t = "
+            f"{time_text(t)} s; it must be a finite number",
             t,
         )
     return float(number)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import ControllerError, InputError, safe_repr
+from srm_mbs.errors import ControllerError, InputError, safe_repr, time_text
 from srm_mbs.model.mechanism import MechanismData
 from srm_mbs.model.numbers import real_array
 
@@ -72,8 +72,8 @@ def evaluate_controller(
     if not isinstance(result, str):
         return result
     raise ControllerError(
-        f"{name} returned {result} at t = {t:.6g} s; it must return {len(v)} finite generalised "
-        "forces, or a mapping of joint names to them",
+        f"{name} returned {result} at t = {time_text(t)} s; it must return {len(v)} finite "
+        "generalised forces, or a mapping of joint names to them",
         t,
     )
 
@@ -97,11 +97,13 @@ def forces_of_joints(
         try:
             joint = mechanism.joint(name)
         except InputError as error:
-            raise ControllerError(f"{own_name} at t = {t:.6g} s: {error}", t) from error
+            raise ControllerError(f"{own_name} at t = {time_text(t)} s: {error}", t) from error
         own = _numbers(force, joint.nv, scalar=True)
         if isinstance(own, str):
             wanted = "a finite number" if joint.nv == 1 else f"{joint.nv} finite numbers"
-            raise ControllerError(f"{own_name} is {own} at t = {t:.6g} s; it must be {wanted}", t)
+            raise ControllerError(
+                f"{own_name} is {own} at t = {time_text(t)} s; it must be {wanted}", t
+            )
         tau[joint.idx_v : joint.idx_v + joint.nv] = own
     return tau
 
@@ -127,7 +129,8 @@ def evaluate_callback(
     if not isinstance(result, str):
         return result
     raise ControllerError(
-        f"{name} returned {result} at t = {t:.6g} s; it must return {size} finite {values}", t
+        f"{name} returned {result} at t = {time_text(t)} s; it must return {size} finite {values}",
+        t,
     )
 
 
@@ -138,7 +141,9 @@ def _output(name: str, function: Controller, t: float, q: FloatArray, v: FloatAr
     except ControllerError:  # of a controller of this package, whose message is complete
         raise
     except Exception as error:
-        raise ControllerError(f"{name} raised {safe_repr(error)} at t = {t:.6g} s", t) from error
+        raise ControllerError(
+            f"{name} raised {safe_repr(error)} at t = {time_text(t)} s", t
+        ) from error
 
 
 def _numbers(given: Any, size: int, scalar: bool = False) -> FloatArray | str:

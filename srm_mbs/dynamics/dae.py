@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO, pivoted_qr, q_columns, whiten
 from srm_mbs.dynamics.system import Zone
-from srm_mbs.errors import CallbackError, EvaluationError, InputError, safe_repr
+from srm_mbs.errors import CallbackError, EvaluationError, InputError, safe_repr, time_text
 from srm_mbs.model.dae import SemiExplicitDAE
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import real_array
@@ -351,14 +351,18 @@ class DaeSystem:
         try:
             value = real_array(getattr(self.problem, name)(t, x.copy()))
         except Exception as error:
-            raise CallbackError(f"{name} raised {safe_repr(error)} at t = {t:.6g}") from error
+            raise CallbackError(
+                f"{name} raised {safe_repr(error)} at t = {time_text(t)}"
+            ) from error
         if value.shape not in self._accepted(name):
             raise CallbackError(
-                f"{name} returned shape {value.shape} at t = {t:.6g}; "
+                f"{name} returned shape {value.shape} at t = {time_text(t)}; "
                 f"it must return {self.shapes[name]}"
             )
         if not np.isfinite(value).all():
-            raise EvaluationError(f"{name} returned values that are not finite at t = {t:.6g}")
+            raise EvaluationError(
+                f"{name} returned values that are not finite at t = {time_text(t)}"
+            )
         return value.reshape(self.shapes[name])
 
     def time_derivative(self, t: float, x: FloatArray) -> FloatArray:

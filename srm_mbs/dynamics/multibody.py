@@ -659,12 +659,20 @@ class ClosedSystem(Mechanics):
         """As for open mechanisms; but more laws than degrees of freedom are one, because closures
         may take up forces far larger than those that move the mechanism: M (1 - P) M^-1 times
         their generalised forces (nv,), which is what closures leave of them."""
+        force = self._joined_force()
+        return super().laws if force is None else self.projection.tangential_force(force)
+
+    def _joined_force(self) -> FloatArray | None:
         if self._joined is None:
-            return super().laws
+            return None
         q, v = self._laws_at
         force = self.damping_force(v) + self.friction_force(v)
-        force = force + self._joined.of_laws(self.data, q, v, self._bushings)
-        return self.projection.tangential_force(force)
+        return force + self._joined.of_laws(self.data, q, v, self._bushings)
+
+    def joined_laws(self) -> tuple[FloatArray, FloatArray] | None:
+        """See :class:`~srm_mbs.dynamics.system.BranchSystem`."""
+        force = self._joined_force()
+        return None if force is None else (force, self.projection.acceleration_by(force))
 
     def constants(self) -> dict[str, Any]:
         """As for open mechanisms, and the closures."""

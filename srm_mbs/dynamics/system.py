@@ -325,6 +325,10 @@ class BranchSystem(System, Protocol):
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> BranchTerms:
         """As :meth:`System.evaluate`."""
 
+    def joined_laws(self) -> tuple[FloatArray, FloatArray] | None:
+        """At the stage evaluated last, the forces F (nv,) of laws of which the system takes what
+        closures leave, and M^-1 F; None if it takes them as they are."""
+
     def working_force(self, t: float, q: FloatArray, v: FloatArray) -> FloatArray:
         """Generalised forces (nv,) that do work: all but those of inertia and of closures."""
 
@@ -352,9 +356,15 @@ def onto_closures(system: System, t: float, state: FloatArray) -> FloatArray:
     """
     if not system.has_constraints:
         return state
+    before = np.inf
     for _ in range(MAX_NEWTON_STEPS):
-        correction = system.evaluate(t, state).correction()
+        terms = system.evaluate(t, state)
+        closed = terms.constraint_residual() < CLOSURE_TOLERANCE
+        correction = terms.correction()
         state = system.retract(state, -correction)
-        if system.position_norm(correction) < CLOSURE_TOLERANCE:
+        size = system.position_norm(correction)
+        # Next to a singular configuration steps end at the rounding of the closures over sigma.
+        if size < CLOSURE_TOLERANCE or (closed and size >= before):
             return state
+        before = size
     raise EvaluationError("no configuration that closes the loops was found near the one given")

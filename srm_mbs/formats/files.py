@@ -37,13 +37,17 @@ _TEMPORARY = re.compile(r"\.srm-[0-9a-f]{16}(?:\..*)?")
 _READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
-def open_regular(path: str | os.PathLike[str], largest: int = LARGEST_FILE) -> IO[bytes]:
+def open_regular(
+    path: str | os.PathLike[str], largest: int = LARGEST_FILE, missing: str = "Check the path"
+) -> IO[bytes]:
     """``path`` opened for reading in binary mode.
 
     Parameters
     ----------
     largest
         Size (bytes) of a file that is not refused.
+    missing
+        Remedy if there is no such file.
 
     Raises
     ------
@@ -54,7 +58,7 @@ def open_regular(path: str | os.PathLike[str], largest: int = LARGEST_FILE) -> I
     try:
         opened = os.open(name, _READING)
     except FileNotFoundError as error:
-        raise InputError("there is no such file", file=name, remedy="Check the path") from error
+        raise InputError("there is no such file", file=name, remedy=missing) from error
     except OSError as error:
         raise InputError(
             f"it cannot be read: {error.strerror}",

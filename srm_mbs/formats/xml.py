@@ -74,6 +74,20 @@ def parse_numbers(text: str, largest: float = LARGEST_MAGNITUDE) -> list[float] 
     return values if small else None
 
 
+ONE_NUMBER = "a finite number"
+
+
+def _writing(text: str, wanted: str) -> str:
+    """The remedy for ``text``, which is not the numbers ``wanted``."""
+    if "${" in text or "$(" in text:
+        return "Run xacro on the file first"
+    if "," in text:
+        if wanted == ONE_NUMBER:
+            return f"Write {wanted} with a decimal point"
+        return f"Write {wanted} with decimal points, and separated by spaces"
+    return f"Write {wanted}"
+
+
 class XmlFile:
     """One XML file for messages: its faults, its numbers, and a count of what is ignored in it.
 
@@ -133,12 +147,12 @@ class XmlFile:
         counts = (count,) if isinstance(count, int) else tuple(count)
         values = parse_numbers(text or "", largest)
         if values is None or len(values) not in counts:
-            wanted = " or ".join(
-                "a finite number" if n == 1 else f"{n} finite numbers" for n in counts
-            )
+            wanted = " or ".join(ONE_NUMBER if n == 1 else f"{n} finite numbers" for n in counts)
             parts = (text or "").split()
             given = repr(" ".join(parts)[:60]) if parts else "nothing"
-            raise self.fault(where, f"{what} is {given}, not {wanted}", f"Write {wanted}")
+            raise self.fault(
+                where, f"{what} is {given}, not {wanted}", _writing(text or "", wanted)
+            )
         return np.array(values)
 
 

@@ -31,7 +31,7 @@ from srm_mbs.dynamics.singularities.critical import (
     critical_configuration,
 )
 from srm_mbs.dynamics.system import BranchSystem, System
-from srm_mbs.errors import EvaluationError
+from srm_mbs.errors import EvaluationError, time_text
 from srm_mbs.integration.control.branch_guard import may_cross
 from srm_mbs.integration.control.placement import zero_within
 from srm_mbs.integration.methods.base import ErrorNorm, Method, StepResult
@@ -851,7 +851,8 @@ class CriticalPassages:
             )
         if missed:
             out += (
-                f" The mechanism avoids its singular configuration near t = {missed[0].time:.6g} s "
+                f" The mechanism avoids its singular configuration near t = "
+                f"{time_text(missed[0].time)} s "
                 f"(residual {missed[0].residual:.1e}) in a layer that the steps may not have "
                 "resolved."
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,9 +13,14 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
-from srm_mbs.errors import ControllerError, EvaluationError, EventError, safe_repr
+from srm_mbs.errors import ControllerError, EvaluationError, EventError, safe_repr, time_text
 from srm_mbs.integration.breakpoints import BreakpointHandler
-from srm_mbs.integration.control.step_size import Proposal, StepDecision, StepSizeControl
+from srm_mbs.integration.control.step_size import (
+    Proposal,
+    StepDecision,
+    StepSizeControl,
+    longest_from_rest,
+)
 from srm_mbs.integration.critical_passages import CriticalPassages
 from srm_mbs.integration.dense_output import StepData, step_data
 from srm_mbs.integration.events import EventWatch, Stop, step_dense
@@ -168,7 +174,7 @@ class RunRecord:
     def mark_finished(self, t_end: float) -> None:
         """Mark it as complete."""
         self.status = RunStatus.FINISHED
-        self.message = f"The run reached t = {t_end:.6g} s."
+        self.message = f"The run reached t = {time_text(t_end)} s."
 
     def mark_stopped(self, stop: Stop) -> None:
         """Mark it as ended by a terminal event."""
@@ -179,11 +185,13 @@ class RunRecord:
         """Mark it as interrupted, or failed because a function of the user raised, at ``t``."""
         if isinstance(error, KeyboardInterrupt):
             self.status = RunStatus.INTERRUPTED
-            self.message = f"Interrupted at t = {t:.6g} s; everything up to there is kept."
+            self.message = f"Interrupted at t = {time_text(t)} s; everything up to there is kept."
         else:
             self.status = RunStatus.FAILED
             self.error = error
-            self.message = f"Stopped at t = {t:.6g} s: {error}. Everything up to there is kept."
+            self.message = (
+                f"Stopped at t = {time_text(t)} s: {error}. Everything up to there is kept."
+            )
 
     def add_pace(self, t_end: float, remedy: str) -> None:
         """Say in the message of an interrupted run to ``t_end`` (s) how many steps remain, with the
@@ -239,7 +247,10 @@ class RunRecord:
         if self.cause is not None:
             remedy = self.cause.remedy
             stopped = f": {self.cause.clause}. With step {h:.1e} s, {failure.sentence}"
-        return f"Stopped at t = {t:.6g} s{stopped}.{near} Everything up to there is kept. {remedy}."
+        return (
+            f"Stopped at t = {time_text(t)} s{stopped}.{near} Everything up to there is kept. "
+            f"{remedy}."
+        )
 
     @property
     def last_state(self) -> FloatArray:
@@ -349,13 +360,15 @@ def integrate(
     unevaluated: RunFailure | None = None
     redone = False
     jump = JumpSearch(system, norm)
+    rest_limit = math.inf
     if breakpoints is not None:
         control.set_target_time(breakpoints.end)
 
     def accept(result: StepResult, t_new: float) -> bool:
         """Move to the end of a step; whether a terminal event ends the run there."""
-        nonlocal t, x
+        nonlocal t, x, rest_limit
         method.accept(memory, result)
+        rest_limit = math.inf
         start, t, x = x, t_new, result.state
         record.times.append(t)
         record.steps.append(result)
@@ -404,11 +417,12 @@ def integrate(
                 on_curve = passages is not None and passages.under_way
                 memory = breakpoints.next(t, x, memory, evaluated=not on_curve)
                 control.set_target_time(breakpoints.end)
+                rest_limit = longest_from_rest(system, memory, norm, breakpoints.end - t)
             if passages is not None and passages.under_way:
                 if not pass_critical(None):
                     memory = restarted()
                 continue
-            limit = min(max_step, system.step_limit(x), jump.limit)
+            limit = min(max_step, system.step_limit(x), jump.limit, rest_limit)
             proposal = control.propose(t, limit, memory)
             if proposal.singular_arrival and breakpoints is not None:
                 memory = breakpoints.singular_arrival(t, x, memory)
@@ -417,7 +431,8 @@ def integrate(
             expected = control.next_zero()
             if pass_critical(None if passages is None else passages.unexamined(expected, t)):
                 continue
-            failure = _no_further_step(record, t, h, t_end, unevaluated, words)
+            last = proposal.t_new == (t_end if breakpoints is None else breakpoints.end)
+            failure = _no_further_step(record, t, h, last, t_end, unevaluated, words)
             if failure is not None:
                 record.mark_failed(failure, t, h, memory.sigma, control.adaptive, words)
                 break
@@ -478,15 +493,22 @@ def _no_further_step(
     record: RunRecord,
     t: float,
     h: float,
+    last: bool,
     t_end: float,
     unevaluated: RunFailure | None,
     words: ProblemVocabulary,
 ) -> RunFailure | None:
     """Why the run cannot continue from ``t`` with a step ``h`` (s); None if it can.
 
-    ``unevaluated``: why the last attempt could not be evaluated.
+    Parameters
+    ----------
+    last
+        Whether the step leads to the end of the run or of a smooth interval, which may be close.
+    unevaluated
+        Why the last attempt could not be evaluated.
     """
-    if not h > max(SMALLEST_STEP * abs(t_end - record.t0), 4.0 * np.spacing(abs(t))):
+    shortest = max(SMALLEST_STEP * abs(t_end - record.t0), 4.0 * np.spacing(abs(t)))
+    if not (last or h > shortest):
         if not (record.attempts and record.attempts[-1].t == t):
             return RunFailure.of(StopReason.ROUND_OFF)
         return unevaluated or RunFailure.of(StopReason.ERROR_ESTIMATE)
@@ -512,7 +534,7 @@ def call_progress(tick: Tick, t: float, h: float, x: FloatArray) -> None:
         tick(t, h, x.copy())
     except Exception as error:
         raise ControllerError(
-            f"the progress callback raised {safe_repr(error)} at t = {t:.6g} s"
+            f"the progress callback raised {safe_repr(error)} at t = {time_text(t)} s"
         ) from error
 
 

@@ -47,7 +47,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
-from srm_mbs.errors import EvaluationError, EventError, InputError, safe_repr
+from srm_mbs.errors import EvaluationError, EventError, InputError, safe_repr, time_text
 from srm_mbs.integration.dense_output import DenseOutput, step_data
 from srm_mbs.integration.methods.base import StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -173,8 +173,9 @@ class EventFunction:
         except Exception as error:
             self.fail(error, t)
         if value.size != 1 or not np.isfinite(value).all():
+            given = None if found is None else value.tolist()
             raise EventError(
-                f"the event {self.name} returned {value.tolist()} at t = {t:.6g} s; "
+                f"the event {self.name} returned {given} at t = {time_text(t)} s; "
                 "it must return one finite number",
                 t,
             )
@@ -183,7 +184,7 @@ class EventFunction:
     def fail(self, error: Exception, t: float) -> NoReturn:
         """Raise the EventError of a function that raised ``error`` at ``t`` (s)."""
         raise EventError(
-            f"the event {self.name} raised {safe_repr(error)} at t = {t:.6g} s", t
+            f"the event {self.name} raised {safe_repr(error)} at t = {time_text(t)} s", t
         ) from error
 
     def floor_at(self, t: float, state: FloatArray) -> float:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+from srm_mbs.errors import time_text
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
 TIMES_LISTED = 5
@@ -92,13 +93,15 @@ def stiffness_sentence(
     """
     if not intervals or not adaptive:
         return ""
-    listed = ", ".join(f"{start:.6g} to {end:.6g} s" for start, end in intervals[:TIMES_LISTED])
+    listed = ", ".join(
+        f"{time_text(start)} to {time_text(end)} s" for start, end in intervals[:TIMES_LISTED]
+    )
     more = ", ..." if len(intervals) > TIMES_LISTED else ""
     if scheme.stiff is not None:
         return f" Stiff, with steps of {scheme.stiff.name}: t = {listed}{more}."
     return (
-        f" The run is stiff from t = {intervals[0][0]:.6g} s on: the stability of {scheme.name} "
-        'limits its steps, not their accuracy. Use tableau="auto" or "rodas5p".'
+        f" The run is stiff from t = {time_text(intervals[0][0])} s on: the stability of "
+        f'{scheme.name} limits its steps, not their accuracy. Use tableau="auto" or "rodas5p".'
     )
 
 
@@ -116,7 +119,7 @@ def branch_changes(times: Sequence[float], what: str, remedy: str) -> str:
     """
     if not times:
         return ""
-    listed = ", ".join(f"{t:.6g}" for t in times[:TIMES_LISTED]) + (
+    listed = ", ".join(time_text(t) for t in times[:TIMES_LISTED]) + (
         ", ..." if len(times) > TIMES_LISTED else ""
     )
     return (

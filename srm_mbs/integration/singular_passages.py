@@ -48,6 +48,7 @@ from srm_mbs.dynamics.singularities.local_analysis import (
     participants,
 )
 from srm_mbs.dynamics.system import SingularityAnalysis, System
+from srm_mbs.errors import time_text
 from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
 from srm_mbs.integration.dense_output import CRITICAL, STEP_PLACEMENTS, DenseOutput, StepData
 from srm_mbs.integration.methods.butcher import SAME_STAGE, ButcherTableau
@@ -91,6 +92,31 @@ RECORDED_DEPTH = 0.75
 is examined: sigma differs from the singular values by some per cent."""
 BESIDE_TURN = np.array([0.5, 0.8, 1.0, 1.25, 2.0])
 """Times at which a crossing beside a turn is looked for, over the one expected."""
+STRAIGHT_AT = np.array([0.5, 1.0])
+"""Where a singular value is compared with a straight line, over the time from its zero to the next
+sample."""
+NEXT_TO_SAMPLE = 0.2
+"""Distance of a crossing from a sample, over the interval, below which that shows no slope."""
+LEAST_SLOPE = 0.5
+"""Growth of sigma over time, over that next to a crossing, below which the motion may turn back."""
+SAMPLES_AROUND = 100
+"""Samples on either side of a crossing at which that is looked for."""
+EVERY = 4
+"""Of these, one of so many shows where the part of G that loses rank changes its sign."""
+FAR_SIGMA = 0.4
+"""sigma above which it has left the crossing."""
+ROUNDED_PART = 1e-12
+"""Size of that part, over the largest around, below which its sign may be rounding."""
+ROOT_TOLERANCE = 1e-3
+"""Accuracy of the times at which it vanishes, over the distance of those between which it does."""
+HIDDEN_WITHIN = 0.1
+"""Time around them in which a further crossing is looked for, over that from the first one."""
+SAME_PASSAGE = 1e-3
+"""Distance in time of two crossings that are one, over that in which the singular value falls to a
+twentieth of those around."""
+TURN_AT = 0.5 ** np.arange(16, -1, -1)
+"""Where the part of G that loses rank is evaluated on the way to the next sample, over it: between
+any two zeros lies one."""
 DIP_WIDTHS = (1, 3)
 """Recorded intervals on either side of a minimum in which it is looked for, one after the other."""
 MAX_REFINEMENTS = 12
@@ -601,6 +627,13 @@ class RecordedDips:
     tops: IndexArray
     turns: Sequence[Turn] | None = None
 
+    def free(self, count: int) -> IndexArray:
+        """First sample and that after the last (n, 2), of ``count``, of those around each minimum
+        that belong to no other one."""
+        first = np.append(0, self.samples[:-1, 2])
+        after = np.append(self.samples[1:, 0], count - 1) + 1
+        return np.column_stack([first, after])
+
     def at_no_turn(self, others: IndexArray, turns: Sequence[Turn]) -> RecordedDips:
         """The minima ``others`` (k,), and the ``turns`` found among the rest."""
         return RecordedDips(self.samples[others], self.tops[others], turns)
@@ -965,14 +998,19 @@ def find_crossings(
         if recorded.turns is None:
             recorded = turns_of(monitor, scheme, steps, recorded)
         searches = [
-            _crossings_at(monitor, steps, t, dip, top)
-            for dip, top in zip(recorded.samples.tolist(), recorded.tops.tolist())
+            _crossings_at(monitor, steps, t, sigma, dip, top, slice(*free))
+            for dip, top, free in zip(
+                recorded.samples.tolist(), recorded.tops.tolist(), recorded.free(len(t)).tolist()
+            )
         ]
-        searches += [_crossings_beside(monitor, steps, t, turn) for turn in recorded.turns or ()]
+        searches += [_crossings_at_turn(monitor, steps, t, turn) for turn in recorded.turns or ()]
     found: dict[float, Crossing] = {}
     for crossings in (*monitor.together(searches), _crossings_along_curves(monitor, steps)):
         for crossing in crossings:
             found.setdefault(crossing.time, crossing)
+    for earlier, later in pairwise(sorted(found)):
+        if later - earlier < SAME_PASSAGE * found[later]._beside:
+            del found[later]
     if resolved:
         for crossing in _avoided_by_steps(monitor, steps, t, resolved, found):
             found[crossing.time] = crossing
@@ -983,12 +1021,15 @@ def _crossings_at(
     monitor: ConstraintMonitor,
     steps: StepData,
     t: FloatArray,
+    sigma: FloatArray,
     dip: Sequence[int],
     top: int,
+    free: slice,
 ) -> Search[list[Crossing]]:
-    """The crossings at a minimum of sigma, the second of the samples ``dip``.
+    """The crossings at a minimum of the recorded ``sigma`` (k,), the second of the samples ``dip``.
 
-    ``dip`` and ``top``, where sigma of the window is largest, are indices into t (k,).
+    ``dip``, ``top``, where sigma of the window is largest, and ``free``, the samples that belong to
+    no other minimum, are indices into t (k,).
     """
     first, k, last = dip
     times = t[sorted({first, max(first, k - 1), k, min(k + 1, last), last})]
@@ -998,47 +1039,56 @@ def _crossings_at(
     scale, values = float(values[-1]), values[:-1]  # that of the window, about the largest
     if _lowest_between(times, values) >= MINIMUM_DEPTH * values.max():
         return []  # sigma has it alone, as where the order of its pivots changes
-    minima = _minima(values, max(scale, float(values.max())))
+    minima, lowest = _minima(values, max(scale, float(values.max()))), None
     if len(minima) == 1:
         near = slice(minima[0][1] - 1, minima[0][1] + 2)
         lowest = yield from _minimum(times[near], values[near])
-        if _vanishes_once(times[near], values[near], lowest, scale):
-            crossing = yield from _crossing_at(
-                monitor, steps, minima[0], scale, times, values, lowest
-            )
-            return [] if crossing is None else [crossing]
-    # The widest has the samples of the others.
-    for width in DIP_WIDTHS if minima else DIP_WIDTHS[-1:]:
-        times = _times_around(t, first, k, last, width, SAMPLES_PER_INTERVAL)
-        values = yield times
-        minima = _minima(values, max(scale, float(values.max())))
-        if minima:
-            break
+        if not _vanishes_once(times[near], values[near], lowest, scale):
+            lowest = None
+    if lowest is None:
+        # The widest has the samples of the others.
+        for width in DIP_WIDTHS if minima else DIP_WIDTHS[-1:]:
+            times = _times_around(t, first, k, last, width, SAMPLES_PER_INTERVAL)
+            values = yield times
+            minima = _minima(values, max(scale, float(values.max())))
+            if minima:
+                break
     found = []
     for minimum in minima:
-        crossing = yield from _crossing_at(monitor, steps, minimum, scale, times, values)
+        crossing = yield from _crossing_at(monitor, steps, minimum, scale, times, values, lowest)
         if crossing is not None:
             found.append(crossing)
-    return found
+    return found + (
+        yield from _hidden_crossings(monitor, steps, found, scale, t[free], sigma[free])
+    )
 
 
-def _crossings_beside(
+def _crossings_at_turn(
     monitor: ConstraintMonitor, steps: StepData, t: FloatArray, turn: Turn
 ) -> Search[list[Crossing]]:
     """The two crossings next to a ``turn`` beyond a singular configuration; t (k,) s of the
     recorded samples."""
-    (before, rest, after), (_, value, _) = turn.times, turn.values
     scale = float((yield t[[turn.top]])[0])
-    found = []
-    for side, size in ((before, turn.values[0]), (after, turn.values[2])):
+    return (yield from _crossings_beside(monitor, steps, turn.times, turn.values, scale))
+
+
+def _crossings_beside(
+    monitor: ConstraintMonitor,
+    steps: StepData,
+    times: Sequence[float],
+    values: Sequence[float],
+    scale: float,
+) -> Search[list[Crossing]]:
+    """The two crossings beside a turn with the ``times`` and ``values`` of a :class:`Turn`."""
+    (before, rest, after), (_, value, _) = times, values
+    found: list[Crossing] = []
+    for side, size in ((before, values[0]), (after, values[2])):
         # Next to the turn values are parabolic in time.
         part = math.sqrt(value / (value - size)) * BESIDE_TURN
-        times = np.sort(np.append(rest + (side - rest) * np.append(0.0, part[part < 1.0]), side))
-        values = yield times
-        k = 1 + int(values[1:-1].argmin())
-        crossing = yield from _crossing_at(
-            monitor, steps, (0, k, len(times) - 1), scale, times, values
-        )
+        own = np.sort(np.append(rest + (side - rest) * np.append(0.0, part[part < 1.0]), side))
+        there = yield own
+        minimum = 0, 1 + int(there[1:-1].argmin()), len(own) - 1
+        crossing = yield from _crossing_at(monitor, steps, minimum, scale, own, there)
         if crossing is not None:
             found.append(crossing)
     return found
@@ -1091,6 +1141,117 @@ def _crossing_at(
                 return None
     slope = float(max(sides[0] / (time - before), sides[1] / (after - time)))
     return crossing_at(monitor, steps, time, VELOCITY_VALUE * scale / slope, kind)
+
+
+def _hidden_crossings(
+    monitor: ConstraintMonitor,
+    steps: StepData,
+    found: list[Crossing],
+    scale: float,
+    t: FloatArray,
+    sigma: FloatArray,
+) -> Search[list[Crossing]]:
+    """The crossings next to those ``found`` that the samples ``sigma`` (k,) at t (k,) do not show:
+    of motions that turn back beyond the singular configuration, and pass it twice."""
+    hidden = []
+    for crossing in found:
+        if crossing.kind != "passed" or not (yield from _may_turn(crossing.time, t, sigma)):
+            continue
+        for zero in (yield from _sign_changes(monitor, crossing.time, scale, t)):
+            away = HIDDEN_WITHIN * abs(zero - crossing.time)
+            times = np.array([max(zero - away, t[0]), zero, min(zero + away, t[-1])])
+            if times[0] < zero < times[-1]:
+                values = yield times
+                other = yield from _crossing_at(monitor, steps, (0, 1, 2), scale, times, values)
+                if other is not None:
+                    hidden.append(other)
+    return hidden
+
+
+def _nearest_samples(time: float, t: FloatArray) -> tuple[int, int]:
+    """Indices into t (k,) of the last sample before and the first after ``time`` (s), but for one
+    that is next to it."""
+    after = int(t.searchsorted(time))
+    before = after - 1
+    if 0 < after < len(t):
+        shortest = NEXT_TO_SAMPLE * (t[after] - t[before])
+        if t[after] - time < shortest:
+            after += 1
+        elif time - t[before] < shortest:
+            before -= 1
+    return max(before, 0), min(after, len(t) - 1)
+
+
+def _may_turn(time: float, t: FloatArray, sigma: FloatArray) -> Search[bool]:
+    """Whether the motion may turn back next to a crossing at ``time`` (s).
+
+    Where it does not, the singular value is proportional to the time from the crossing up to the
+    samples next to it, and ``sigma`` (k,) at t (k,) goes on growing as fast beyond them.
+    """
+    nearest = _nearest_samples(time, t)
+    if not t[nearest[0]] < time < t[nearest[1]]:
+        return False  # at an end of the run
+    slopes = [float(sigma[i]) / abs(float(t[i]) - time) for i in nearest]
+    least = LEAST_SLOPE * max(slopes)
+    if min(slopes) < least:
+        return True
+    for i, way in zip(nearest, (-1, 1)):
+        for _ in range(SAMPLES_AROUND):
+            following = i + way
+            if not 0 <= following < len(t) or sigma[i] > FAR_SIGMA:
+                break
+            if sigma[following] - sigma[i] < least * abs(t[following] - t[i]):
+                return True
+            i = following
+    values = yield np.concatenate([time + (t[i] - time) * STRAIGHT_AT for i in nearest])
+    half_before, before, half_after, after = values.tolist()
+    return not (
+        before < 2.0 * SLOPE_MARGIN * half_before < 2.0 * SLOPE_MARGIN**2 * before
+        and after < 2.0 * SLOPE_MARGIN * half_after < 2.0 * SLOPE_MARGIN**2 * after
+    )
+
+
+def _sign_changes(
+    monitor: ConstraintMonitor, time: float, scale: float, t: FloatArray
+) -> Search[list[float]]:
+    """About when (s), next to a crossing at ``time``, the part of G that loses rank there is zero;
+    t (k,): the recorded samples."""
+    from scipy.optimize import brentq
+
+    before, after = _nearest_samples(time, t)
+    times = np.concatenate(
+        [
+            t[max(before - SAMPLES_AROUND, 0) : before][::-EVERY][::-1],
+            time + (t[before] - time) * TURN_AT[::-1],
+            time + (t[after] - time) * TURN_AT,
+            t[after + 1 : after + 1 + SAMPLES_AROUND][::EVERY],
+        ]
+    )
+    G = monitor.normalised(np.concatenate([[time], times]))
+    active = np.logical_or.reduce([active_rows(rows) for rows in G])
+    left, right = monitor.near_null_spaces(G[0, active], active)
+    parts = (left.T @ G[1:, active] @ right).reshape(len(times), -1)
+    reference = parts[times.searchsorted(t[after])]
+    along = parts @ reference
+    signed = np.abs(along) > ROUNDED_PART * np.abs(along).max()
+    times, along = times[signed], along[signed]
+
+    def part(at: float) -> float:
+        own = left.T @ monitor.normalised(np.array([at]))[0, active] @ right
+        return float(own.ravel() @ reference)
+
+    changes = np.flatnonzero(along[:-1] * along[1:] < 0.0).tolist()
+    if len(changes) < 2:
+        return []
+    # Where the singular value is largest between two zeros.
+    tops = [int(np.abs(along[a + 1 : b + 1]).argmax()) + a + 1 for a, b in pairwise(changes)]
+    beyond = (yield times[tops]) > UNTOUCHED_VALUE * scale
+    real = np.append(beyond, False) | np.append(False, beyond)
+    return [
+        float(brentq(part, times[k], times[k + 1], xtol=ROOT_TOLERANCE * (times[k + 1] - times[k])))
+        for k, is_real in zip(changes, real)
+        if is_real
+    ]
 
 
 def _lowest_between(t: FloatArray, values: FloatArray) -> float:
@@ -1155,15 +1316,16 @@ class Bifurcation:
         return self._crossing.arrived_on
 
     def __str__(self) -> str:
-        span = f"From t = {self.start:.6g} to {self.end:.6g} s the motion stayed"
-        moment = f"At t = {self.start:.6g} s the motion turned back"
+        span = f"From t = {time_text(self.start)} to {time_text(self.end)} s the motion stayed"
+        moment = f"At t = {time_text(self.start)} s the motion turned back"
         kept = "" if self.kept is None else f", number {self.kept}"
         did = "stopped there" if self.stopped else f"kept the one it came along{kept}"
+        number = f"{len(self.branches)} " if len(self.branches) else ""
         return (
             f"{span if self.end > self.start else moment} next to a singular "
             f"configuration of {self._crossing.participants} without the "
-            f"momentum to choose one of the {len(self.branches)} branches that meet there: the run "
-            f"{did} (solution.bifurcations)"
+            f"momentum to choose one of the {number}branches that meet there: the run {did} "
+            "(solution.bifurcations)"
         )
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.dae import DaeSystem
 from srm_mbs.dynamics.singularities.branch_limit import lagrange_weights
+from srm_mbs.errors import time_text
 from srm_mbs.integration.dense_output import DenseOutput, StepData, checked_output_times
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.methods.base import Method
@@ -157,6 +158,6 @@ class DaeResult(RunOutcome):
 
     def __repr__(self) -> str:
         return (
-            f"DaeSolution(t={self.steps.times[0]:.6g}..{self.steps.times[-1]:.6g}, "
+            f"DaeSolution(t={time_text(self.steps.times[0])}..{time_text(self.steps.times[-1])}, "
             f"{len(self.t)} points, {self.stats.steps} steps, {self.status})"
         )

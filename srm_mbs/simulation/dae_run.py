@@ -9,7 +9,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.dae import DaeSystem
-from srm_mbs.errors import ControllerError, EvaluationError, InputError, safe_repr
+from srm_mbs.errors import ControllerError, EvaluationError, InputError, safe_repr, time_text
 from srm_mbs.integration.control.prescribed_times import suspected
 from srm_mbs.integration.control.step_size import ControlWrapper
 from srm_mbs.integration.driver import RunRecord, RunStatus
@@ -229,13 +229,15 @@ def _add_sweep_failure(
     if unstable is not None:
         if turned:  # that they turned follows from it
             end = record.times[-1] if record.times else options.t0
-            record.message = f"Stopped at t = {end:.6g}: x' turned. Everything up to there is kept."
+            record.message = (
+                f"Stopped at t = {time_text(end)}: x' turned. Everything up to there is kept."
+            )
         record.stop_reason = unstable.reason
         record.message += f" {unstable.sentence}"
     elif turned:
         if record.status is not RunStatus.FAILED:  # within the passage
             record.status = RunStatus.FAILED
-            record.message = f"On another branch of g = 0 from t = {turned[0]:.6g} on."
+            record.message = f"On another branch of g = 0 from t = {time_text(turned[0])} on."
         record.message += " " + (CARRIED_Y_REMEDY if carries_y else TURN_REMEDY)
     elif record.status is RunStatus.FAILED and carries_y:
         record.message += INSTABILITY_REMEDY

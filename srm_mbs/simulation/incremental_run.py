@@ -16,7 +16,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.errors import EvaluationError, SimulationError
+from srm_mbs.errors import EvaluationError, SimulationError, time_text
 from srm_mbs.integration.breakpoints import SingularProximity, beside_singular, smooth_intervals
 from srm_mbs.integration.control.step_size import (
     ControlWrapper,
@@ -152,7 +152,9 @@ class IncrementalRun(ABC):
             raise self._stopped("", error) from error
 
     def _stopped(self, step: str, why: object) -> SimulationError:
-        message = f"Stopped at t = {self.t:.6g} s{step}: {why}. The state is the last good one."
+        message = (
+            f"Stopped at t = {time_text(self.t)} s{step}: {why}. The state is the last good one."
+        )
         return SimulationError(message, None)
 
     @abstractmethod

@@ -24,7 +24,7 @@ from srm_mbs.dynamics.point_motion import (
     point_positions,
     point_velocities,
 )
-from srm_mbs.errors import InputError, KnownKeys, safe_repr
+from srm_mbs.errors import InputError, KnownKeys, safe_repr, time_text
 from srm_mbs.integration.dense_output import (
     DenseOutput,
     StepData,
@@ -48,6 +48,7 @@ from srm_mbs.integration.singular_passages import (
 )
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.lazy import cached_property
+from srm_mbs.simulation.consistency import closed_end
 from srm_mbs.simulation.energy_balance import EnergyBalance, Powers, energy_balance
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.streamed_output import StreamedOutput
@@ -324,7 +325,23 @@ class SimulationResult(RunOutcome):
 
     @cached_property
     def _nodes(self) -> tuple[FloatArray, FloatArray]:
-        """Times (n,) s, and states (n, nx) there."""
+        """Times (n,) s, and states (n, nx) there; that at the end of the run is on the closures."""
+        t, states = self._computed_nodes
+        mechanism = self.mechanism
+        ended = self.status is not RunStatus.FAILED and len(t) and t[-1] == self.span[1]
+        if not (ended and mechanism.constrained):
+            return t, states
+        end = states[-1]
+        last = closed_end(mechanism, float(t[-1]), end, self.backend, self._system)
+        if last is not end:
+            states = states.copy()
+            states[-1] = last
+            states.setflags(write=False)
+        return t, states
+
+    @cached_property
+    def _computed_nodes(self) -> tuple[FloatArray, FloatArray]:
+        """Times (n,) s, and states (n, nx) there, as the steps have them."""
         output = self._run.output
         if output is not None:
             return output.t, output.states
@@ -351,8 +368,8 @@ class SimulationResult(RunOutcome):
 
     @property
     def last_state(self) -> FloatArray:
-        """q and v (nq + nv,) in the last row."""
-        last: FloatArray = self._nodes[1][-1]
+        """q and v (nq + nv,) in the last row, as the steps have them."""
+        last: FloatArray = self._computed_nodes[1][-1]
         return last
 
     @property
@@ -749,7 +766,7 @@ class SimulationResult(RunOutcome):
     def __repr__(self) -> str:
         first, last = (self.t[0], self.t[-1]) if len(self.t) else (0.0, 0.0)
         return (
-            f"Solution({self.mechanism.name!r}, t={first:.6g}..{last:.6g} s, "
+            f"Solution({self.mechanism.name!r}, t={time_text(first)}..{time_text(last)} s, "
             f"{len(self.t)} points, {self.stats.steps} steps, {self.status}, "
             f"{self.settings.backend})"
         )

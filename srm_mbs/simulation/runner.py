@@ -16,14 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.controllers import Controller, HeldForce, evaluate_controller
 from srm_mbs.dynamics.forces import over_half_turn
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.scaling import (
     Units,
-    constraint_units,
     position_rounding,
     start_rounding,
 )
@@ -35,6 +33,7 @@ from srm_mbs.errors import (
     InputError,
     SimulationError,
     safe_repr,
+    time_text,
     warn,
 )
 from srm_mbs.integration import driver
@@ -59,7 +58,6 @@ from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord, StepSummary
 from srm_mbs.integration.kernel.events import CompiledEventWatch
 from srm_mbs.integration.kernel.marshalling import state_from
-from srm_mbs.integration.kernel.observables import closure_errors, largest_errors
 from srm_mbs.integration.kernel.run import CompiledRun, first_stage
 from srm_mbs.integration.kernel.system import Evaluator, SuccessiveWorkspaces, shared
 from srm_mbs.integration.messages import (
@@ -81,9 +79,9 @@ from srm_mbs.integration.singular_passages import (
 )
 from srm_mbs.model.forces import LimitSpring
 from srm_mbs.model.lazy import cached_property
-from srm_mbs.model.mechanism import per_model, per_start, per_tree
+from srm_mbs.model.mechanism import per_model, per_tree
 from srm_mbs.model.numbers import finite_array
-from srm_mbs.model.validation import START_ARGUMENTS
+from srm_mbs.simulation.consistency import check_consistent
 from srm_mbs.simulation.failure_causes import (
     HeldForceWatch,
     failure_cause,
@@ -117,8 +115,6 @@ DESCRIBED_BIFURCATIONS = 2
 """Bifurcations that the message of a run describes."""
 LIMIT_ROUNDING = 1e-12
 """Distance (rad, m) beyond a joint limit that is rounding; times |q| where that is above 1."""
-CONSISTENT = 1e-8
-"""Largest closure error of an accepted start, in row units, and of its rates in those per time."""
 LONGEST_REPEATED = 2.0
 """Longest first step of a segment that continues another, over the length of that one: events come
 as soon again, and a longer step would be read at its beginning only."""
@@ -465,72 +461,6 @@ def initial_state(
     return mechanism, mechanism.start_state
 
 
-@per_start
-def _accepted_times(mechanism: Mechanism) -> set[float]:
-    """Times (s) at which the initial state satisfies closures and drives, as far as checked."""
-    return set()
-
-
-def check_consistent(
-    mechanism: Mechanism,
-    t: float = 0.0,
-    backend: str = "python",
-    system: OpenSystem | ClosedSystem | None = None,
-    names: tuple[str, str] = START_ARGUMENTS,
-) -> None:
-    """Refuse a start at ``t`` (s) that violates the closures, the drives or their rates, which
-    ``backend`` evaluates; ``system`` is that of the mechanism, if it is at hand.  Messages call
-    positions and rates ``names``.
-
-    Raises
-    ------
-    InputError
-        Naming the row that is violated most.
-    """
-    accepted = _accepted_times(mechanism)
-    if t not in accepted:
-        _check_errors(mechanism, t, backend, system, names)
-        accepted.add(t)
-
-
-def _check_errors(
-    mechanism: Mechanism,
-    t: float,
-    backend: str,
-    system: OpenSystem | ClosedSystem | None,
-    names: tuple[str, str],
-) -> None:
-    q0, v0 = mechanism.q0, mechanism.v0
-    units = mechanism.structure.units
-    unit = constraint_units(mechanism, units)
-    by_kernel = backend in COMPILED and not mechanism.drives
-    if by_kernel:
-        open_by, rate = largest_errors(mechanism, t, q0, v0, unit, system)
-        if open_by <= CONSISTENT and rate <= CONSISTENT * units.rate:
-            return
-    speed = max(units.rate, *np.abs(v0 / units.coordinate).tolist())
-    start = np.array([t]), q0[None], v0[None]
-    if by_kernel:
-        g, c = (e[0] for e in closure_errors(mechanism, *start, system))
-    elif t == 0.0:
-        g, c = mechanism.initial_errors
-    else:
-        g, c = (e[0] for e in constraint_errors(mechanism, *start))
-    if not len(g):
-        return
-    for what, values, limit in zip(names, (g, c), (CONSISTENT, CONSISTENT * speed), strict=True):
-        errors = np.abs(values) / unit
-        if max(errors.tolist()) > limit:
-            worst = int(errors.argmax())
-            kind = "drives" if worst >= len(g) - len(mechanism.drives) else "closures"
-            raise InputError(
-                f"the initial state violates the {kind}: row "
-                f"{mechanism.structure.row_names[worst]} by {values[worst]:.1e}",
-                element=what,
-                remedy="Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v",
-            )
-
-
 # --- assemble the problem -------------------------------------------------------------------------
 
 
@@ -737,7 +667,10 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
     try:
         run = _compiled_run(problem, kernel_system, first, given, handler)
     except ArithmeticError:  # the reference raises the error that says why
-        first_step = chosen_first_step(evaluator, norm, options, state_from(first), state)
+        known = state_from(first)
+        first_step = chosen_first_step(
+            evaluator, norm, options, known, state, smooth_until=handler.end
+        )
         run = _compiled_run(problem, kernel_system, first, first_step, handler)
     with progress_of(options.progress, system, options.t_end) as tick:
         record = kernel_driver.integrate(
@@ -800,7 +733,15 @@ def integrate_steps(
     control, wrappers = placed_control(
         system,
         options,
-        lambda: chosen_first_step(system, norm, options, memory, state, last_step),
+        lambda: chosen_first_step(
+            system,
+            norm,
+            options,
+            memory,
+            state,
+            last_step,
+            np.inf if handler is None else handler.end,
+        ),
         handler is not None and handler.arrivals,
     )
     with progress_of(options.progress, system, options.t_end) as tick:
@@ -831,14 +772,18 @@ def chosen_first_step(
     memory: IntegratorState,
     state: FloatArray,
     last_step: float = 0.0,
+    smooth_until: float = np.inf,
 ) -> float:
     """The given first step (s), the ``last_step`` of the segment before, if there is one with the
-    same equations, or the step that the start of the run allows."""
+    same equations, or the step that the start of the run allows, which is smooth until
+    ``smooth_until`` (s)."""
     if options.first_step is not None:
         return float(options.first_step)
     order = options.method.scheme.controller_order or 1
     span, t0 = options.t_end - options.t0, options.t0
-    return last_step or initial_step(evaluator, state, memory, norm, span, order, t0)
+    return last_step or initial_step(
+        evaluator, state, memory, norm, span, order, t0, smooth_until - t0
+    )
 
 
 def failed_start(t0: float, state: FloatArray, error: Exception, unit: str = "") -> RunRecord:
@@ -846,7 +791,7 @@ def failed_start(t0: float, state: FloatArray, error: Exception, unit: str = "")
     record = RunRecord(t0, state.copy())
     record.status = RunStatus.FAILED
     record.error = error
-    record.message = f"Stopped at t = {t0:.6g}{unit}: {error}."
+    record.message = f"Stopped at t = {time_text(t0)}{unit}: {error}."
     return record
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
-from srm_mbs.errors import EvaluationError, EventError, InputError, get_logger, safe_repr
+from srm_mbs.errors import EvaluationError, EventError, InputError, get_logger, safe_repr, time_text
 from srm_mbs.integration.contacts import Contact, ContactProbe
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import (
@@ -36,11 +36,11 @@ from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
 from srm_mbs.model.numbers import positive_number
 from srm_mbs.model.validation import STATE_ARGUMENTS
+from srm_mbs.simulation.consistency import check_consistent
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.runner import (
     Segment,
-    check_consistent,
     checked_options,
     finished,
     initial_state,
@@ -389,7 +389,7 @@ def _run_segments(
             if not parts:
                 raise
             status = RunStatus.INTERRUPTED
-            message = f"Interrupted at t = {t:.6g} s; everything up to there is kept."
+            message = f"Interrupted at t = {time_text(t)} s; everything up to there is kept."
         else:
             status = RunStatus.RUNNING if t_end - t > NEGLIGIBLE_REST * span else RunStatus.FINISHED
         finally:

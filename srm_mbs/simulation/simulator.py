@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from functools import wraps
+from threading import Lock
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -20,6 +22,7 @@ from srm_mbs.errors import (
     InputError,
     SimulationError,
     safe_repr,
+    time_text,
 )
 from srm_mbs.integration.breakpoints import smooth_intervals
 from srm_mbs.integration.generated.policy import charge, code_of_run
@@ -30,6 +33,7 @@ from srm_mbs.integration.methods.branch_nodes import onto_closed_branch
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.numbers import positive_number, real_array
 from srm_mbs.model.validation import STATE_ARGUMENTS
+from srm_mbs.simulation.consistency import check_consistent
 from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
 from srm_mbs.simulation.incremental_run import IncrementalRun, KernelRun, ReferenceRun
 from srm_mbs.simulation.options import (
@@ -41,7 +45,6 @@ from srm_mbs.simulation.options import (
 from srm_mbs.simulation.result import Statistics
 from srm_mbs.simulation.runner import (
     above_rounding,
-    check_consistent,
     checked_accuracy,
     error_norm,
 )
@@ -60,13 +63,37 @@ CHARGED = 0.05
 BREAKPOINT_ROUNDING = 1e-14
 """Distance of a breakpoint from the end of a step that is rounding, over the time."""
 
+Called = TypeVar("Called", bound=Callable[..., Any])
+
+
+def _alone(called: Called) -> Called:
+    """``called``, a method, refuses to run while such a method of the same simulator runs: its run
+    is one memory, from which the kernel works without the interpreter's lock."""
+
+    @wraps(called)
+    def checked(self: Simulator, *args: Any, **kwargs: Any) -> Any:
+        if not self._lock.acquire(blocking=False):
+            raise InputError(
+                "another thread uses this simulator, or a function that it calls does",
+                element="simulator",
+                remedy="Give each thread a clone() of its own",
+            )
+        try:
+            return called(self, *args, **kwargs)
+        finally:
+            self._lock.release()
+
+    return cast(Called, checked)
+
 
 class Simulator:
     """A mechanism at a time, with a state, that :meth:`step` moves on.
 
     One compiled run is kept alive; nothing is recorded, so that memory does not grow.  Each step
     takes as many inner steps as the tolerance needs; singular configurations are passed as in
-    :func:`srm_mbs.simulate`.  The same calls give the same numbers, bit by bit.
+    :func:`srm_mbs.simulate`.  The same calls give the same numbers, bit by bit.  One thread at a
+    time uses a simulator: a call during another one is refused; each thread may have a
+    :meth:`clone`.
 
     Parameters
     ----------
@@ -117,6 +144,7 @@ class Simulator:
 
     def _make(self) -> None:
         """A run of its own."""
+        self._lock = Lock()
         held = HeldForce()
         held.only(self._no_force)
         self._system = make_system(self._mechanism, held)
@@ -161,6 +189,7 @@ class Simulator:
         """Work done since it was made: inner steps, evaluations, seconds within :meth:`step`."""
         return self._run.statistics(self._wall_time)
 
+    @_alone
     def step(self, dt: float, tau: Any = None) -> tuple[FloatArray, FloatArray]:
         """Move on by ``dt`` (s).
 
@@ -259,7 +288,7 @@ class Simulator:
         try:
             self._run.begin(t, state, force, dt, smooth_until)
         except EvaluationError as error:
-            raise SimulationError(f"Stopped at t = {t:.6g} s: {error}.", None) from error
+            raise SimulationError(f"Stopped at t = {time_text(t)} s: {error}.", None) from error
         self._pending_start = None
 
     def _charge(self) -> None:
@@ -313,6 +342,7 @@ class Simulator:
             steps += self._run.last_steps
         self._busy = steps >= MANY_STEPS
 
+    @_alone
     def reset(
         self, q: Any = None, v: Any = None, t: float = 0.0, *, project: bool = False
     ) -> tuple[FloatArray, FloatArray]:
@@ -340,6 +370,8 @@ class Simulator:
         mechanism = self._mechanism
         t = finite(t, "t")
         if q is None and v is None and not project:
+            if mechanism.drives:
+                check_consistent(mechanism, t, names=STATE_ARGUMENTS)
             state = mechanism.start_state
         else:
             q = mechanism.q0 if q is None else q
@@ -351,6 +383,7 @@ class Simulator:
         self._busy = False
         return self.q, self.v
 
+    @_alone
     def set_state(self, q: Any = None, v: Any = None, *, project: bool = False) -> None:
         """Change the state at the current time.
 
@@ -388,6 +421,7 @@ class Simulator:
         check_consistent(moved, t, names=STATE_ARGUMENTS)
         return moved.start_state
 
+    @_alone
     def clone(self) -> Simulator:
         """An independent copy, which continues identically; its statistics start at 0."""
         other = Simulator.__new__(Simulator)
@@ -415,12 +449,14 @@ class Simulator:
         )
 
     def __repr__(self) -> str:
-        return f"Simulator({self._mechanism.name!r}, t={self.t:.6g} s)"
+        return f"Simulator({self._mechanism.name!r}, t={time_text(self.t)} s)"
 
 
 def _failed(t: float, cause: FailureCause) -> SimulationError:
     """The error of a step that failed at ``t`` (s) by ``cause``."""
-    return SimulationError(f"Stopped at t = {t:.6g} s: {cause.clause}. {cause.remedy}.", None)
+    return SimulationError(
+        f"Stopped at t = {time_text(t)} s: {cause.clause}. {cause.remedy}.", None
+    )
 
 
 def _bad_force(tau: Any, size: int) -> InputError:

@@ -335,7 +335,7 @@ def load_result(path: Path, types: ResultTypes[R], reach: Reach) -> R:
         If the file is missing, is no saved run, is of another format, or unpacks to more than
         :mod:`srm_mbs.formats.archive` allows.
     """
-    with _naming(str(path)), open_regular(path, LARGEST_CONTENT) as file:
+    with _naming(str(path)), open_regular(path, LARGEST_CONTENT, SAVED_BY) as file:
         return load_from(file, path, types, reach)
 
 
@@ -366,8 +366,10 @@ def _naming(name: str) -> Iterator[None]:
 
 def _check_format(what: str, found: Any, known: tuple[int, ...]) -> None:
     if type(found) is not int or found not in known:
+        readable = " and ".join(map(str, sorted(known)))
         raise InputError(
-            f"{what} format {str(found)[:20]}, this version reads {known[0]}", remedy=OTHER_VERSION
+            f"{what} format {str(found)[:20]}, this version reads {readable}",
+            remedy=OTHER_VERSION,
         )
 
 

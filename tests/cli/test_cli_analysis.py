@@ -79,3 +79,29 @@ def test_simulate_prints_the_balance_when_asked() -> None:
     assert row(output, "work of force motor").endswith(" J")
     assert "open by at most" in row(output, "balance")
     assert "balance" not in run("simulate", "four_bar", "--t-end", 0.1)
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        ("equilibrium four_bar --hold wheel=1", "--hold"),
+        ("equilibrium four_bar --hold rocker=3", "--hold"),
+        ("modes four_bar --hold wheel=1", "--hold"),
+        ("linearise four_bar --input wheel", "--input"),
+        ("linearise four_bar --coordinate wheel", "--coordinate"),
+        ("simulate four_bar --q wheel=1", "--q"),
+        ("simulate four_bar --q rocker=3", "--q"),
+        ("simulate four_bar --v wheel=1", "--v"),
+        ("simulate four_bar --control wheel=1", "--control"),
+    ],
+)
+def test_a_value_that_does_not_fit_the_mechanism_is_named_by_its_option(
+    words: str, option: str
+) -> None:
+    assert run(*words.split(), status=2).startswith(f"error: {option}: ")
+
+
+@pytest.mark.parametrize("command", ["plot", "play", "report"])
+def test_a_run_that_is_not_there_is_asked_for_as_a_saved_run(command: str, tmp_path: Path) -> None:
+    refused = run(command, tmp_path / "none.npz", status=2)
+    assert "Give a file written by solution.save or srm-mbs simulate --out" in refused

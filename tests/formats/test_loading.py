@@ -1143,3 +1143,10 @@ def test_without_the_kernel_an_n_four_bar_must_be_smaller(monkeypatch: pytest.Mo
     monkeypatch.setattr("srm_mbs._kernel.core", None)
     with pytest.raises(srm.InputError, match=r"too large.*N <= 300, or N <= 1000 with the comp"):
         srm.n_four_bar(301)
+
+
+def test_a_table_that_is_there_twice_is_refused_with_the_brackets_of_a_list(tmp_path: Path) -> None:
+    path = tmp_path / "two.toml"
+    path.write_text('format = 1\n[loop]\nname = "a"\n[loop]\nname = "b"\n', encoding="utf-8")
+    with pytest.raises(srm.InputError, match=r"double brackets .* as \[\[loop\]\]"):
+        srm.load(path)

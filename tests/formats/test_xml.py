@@ -109,3 +109,21 @@ def test_a_second_declaration_is_refused() -> None:
     text = '<?xml version="1.0"?><a><?xml version="1.0"?></a>'
     with pytest.raises(srm.InputError, match="not well-formed"):
         parse_xml(text, "x.urdf")
+
+
+@pytest.mark.parametrize(
+    ("text", "remedy"),
+    [
+        ("${reach} 0 0", "Run xacro on the file first"),
+        ("$(arg reach) 0 0", "Run xacro on the file first"),
+        ("0,2 0,0 0", "Write 3 finite numbers with decimal points, and separated by spaces"),
+        ("0.2, 0, 0", "Write 3 finite numbers with decimal points, and separated by spaces"),
+        ("0.2 0", "Write 3 finite numbers"),
+    ],
+)
+def test_numbers_that_are_none_are_refused_with_the_remedy_for_what_was_written(
+    text: str, remedy: str
+) -> None:
+    with pytest.raises(srm.InputError) as refused:
+        xml.XmlFile("x.urdf").numbers(text, 3, "joint 'a'", "<origin xyz>")
+    assert refused.value.remedy == remedy

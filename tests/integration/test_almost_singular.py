@@ -232,6 +232,24 @@ def test_dense_output_in_a_narrow_layer_has_its_rates(d: float) -> None:
     assert errors[:, 1].max() < 5e-5 * np.abs(v).max()
 
 
+@pytest.mark.parametrize("off", [-1e-4, -1e-6, 1e-6, 1e-4])
+@pytest.mark.parametrize("d", [-1e-6, -1e-8])
+def test_an_action_in_a_narrow_layer_finds_the_closures(d: float, off: float) -> None:
+    """Newton's steps onto them end at rounding over sigma, which is far above rounding."""
+    mechanism = slider_crank(d)
+    ideal = srm.simulate(mechanism, 1.0, rtol=1e-8, singular_tolerance=0.0)
+    time = ideal.crossings[1].time + off
+    event = srm.Event(lambda t, q, v: t - time, action=lambda t, q, v: (q, v))
+
+    run = srm.simulate(mechanism, 1.0, rtol=1e-8, singular_tolerance=0.0, events=event)
+
+    assert run.success, run.message
+    assert len(run.segments) == 2
+    assert run.drift[:, 0].max() < 1e-11
+    # Dense output in the layer, from which the action starts, errs by 1e-5 of the rates.
+    assert Reference(d).error(run) < 5e-4
+
+
 def test_a_saved_run_reads_the_same_within_a_passage(tmp_path: Any) -> None:
     run = srm.simulate(slider_crank(1e-8), 0.5)
     run.save(tmp_path / "run.npz")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -19,7 +20,7 @@ from srm_mbs.integration import singular_passages as crossings_module
 from srm_mbs.integration.kernel import dense_output as kernel_steps
 from srm_mbs.integration.singular_passages import ConstraintMonitor
 from tests.support import reduced, turning
-from tests.support.backends import needs_kernel
+from tests.support.backends import needs_kernel, on_both
 from tests.support.bundled import load
 from tests.support.mechanisms import (
     along_x,
@@ -384,6 +385,31 @@ def test_hinges_of_two_points_next_to_each_other_pass_like_hinges(
         angles = 2.0 * np.arctan2(quaternions[:, :, 1], quaternions[:, :, 3])
         off = angles + np.cumsum(expected(t)[0], axis=1)
         assert np.abs(np.angle(np.exp(1j * off))).max() < 10.0 * rtol
+
+
+@on_both
+@pytest.mark.parametrize("reach", [3e-2, 1e-3, 1e-4])
+@pytest.mark.parametrize(
+    "turned", [turning.driven, turning.driven_with_pendulum, turning.on_a_cart]
+)
+def test_a_motion_that_turns_back_beyond_a_singular_configuration_passes_it_twice(
+    turned: Callable[[float, float], turning.Motion], reach: float, backend: str
+) -> None:
+    """The crank is at its change point, at angle 0, where the exact motion says."""
+    motion = turned(reach, 0.5)
+    crank = motion.mechanism.model.joints[motion.mechanism.model.getJointId("crank")].idx_q
+    t = np.linspace(0.0, motion.t_end, 4001)
+    angle = motion.exact(t)[0][:, crank]
+    k = np.flatnonzero(angle[:-1] * angle[1:] < 0.0)
+    expected = t[k] + (t[k + 1] - t[k]) * angle[k] / (angle[k] - angle[k + 1])
+    assert len(expected) == 2
+    for tableau, rtol in (("dop853", 1e-6), ("dop853", 1e-9), ("dopr54", 1e-8)):
+        run = srm.simulate(
+            motion.mechanism, motion.t_end, rtol=rtol, tableau=tableau, backend=backend
+        )
+        assert [crossing.kind for crossing in run.crossings] == ["passed"] * 2
+        apart = expected[1] - expected[0]
+        assert np.abs(times(run) - expected).max() < 0.01 * apart + 1e-5 * motion.t_end
 
 
 @pytest.mark.parametrize("amplitude", [3e-2, 3e-3])

@@ -352,6 +352,10 @@ def is_nan(t: float, q: Any, v: Any) -> float:
     return float("nan") if t > 0.7 else 1.0
 
 
+def is_none(t: float, q: Any, v: Any) -> Any:
+    return None if t > 0.7 else 1.0
+
+
 def is_vector(t: float, q: Any, v: Any) -> Any:
     return v if t > 0.7 else 1.0
 
@@ -366,6 +370,7 @@ def is_complex(t: float, q: Any, v: Any) -> Any:
     [
         (raises, "no light"),
         (is_nan, "returned nan"),
+        (is_none, "returned None"),
         (is_vector, "one finite number"),
         (is_complex, "complex values"),
     ],

@@ -36,7 +36,7 @@ from tests.support.stiff import (
     rubbing,
     rubbing_slider_crank,
 )
-from tests.support.turning import lifted
+from tests.support.turning import lifted, sprung
 
 BACKENDS = ("kernel", "python")
 SLOW_PYTHON = ("kernel", pytest.param("python", marks=pytest.mark.stress))
@@ -551,6 +551,51 @@ def test_rodas5p_passes_singular_configurations_as_accurately_as_others(
         assert motion.error(run) < 20.0 * rtol
         assert run.stats.steps < 400
         assert len(run.crossings) == passages
+
+
+@pytest.mark.parametrize("backend", SLOW_PYTHON)
+@pytest.mark.parametrize("reach", [3e-3, 1e-3, 1e-4, -1e-4, -1e-3])
+@pytest.mark.parametrize(("stiffness", "damping"), [(40.0, 0.5), (400.0, 1.0), (4000.0, 20.0)])
+def test_rodas5p_turns_back_beside_singular_configurations_within_the_tolerance(
+    stiffness: float, damping: float, reach: float, backend: str
+) -> None:
+    """More springs and dampers than degrees of freedom: what closures leave of them follows from
+    nodes of the branch."""
+    motion = sprung(reach, stiffness, damping)
+    for rtol in (1e-6, 1e-8, 1e-9, 1e-10, 1e-11):
+        run = srm.simulate(
+            motion.mechanism, motion.t_end, rtol=rtol, tableau="rodas5p", backend=backend
+        )
+        assert motion.error(run) < 20.0 * rtol
+        assert run.stats.steps < 300
+
+
+def test_kernel_and_reference_turn_back_alike_beside_a_singular_configuration() -> None:
+    motion = sprung(1e-3, 400.0, 1.0)
+    kernel, reference = (
+        srm.simulate(motion.mechanism, motion.t_end, rtol=1e-8, tableau="rodas5p", backend=backend)
+        for backend in BACKENDS
+    )
+    assert kernel.stats.steps == pytest.approx(reference.stats.steps, rel=0.1)
+    np.testing.assert_allclose(end_of(kernel), end_of(reference), rtol=0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("rtol", [1e-6, 1e-7, 1e-8])
+def test_dry_friction_that_turns_back_in_a_dead_point_takes_the_energy_of_its_work(
+    rtol: float,
+) -> None:
+    mechanism = rubbing("spatial_dead_point", 0.05, 1e-5)
+    run = srm.simulate(mechanism, 4.0, rtol=rtol)
+    assert run.success, run.message
+    times = np.linspace(0.0, 4.0, 20001)
+    _, v = run(times)
+    power = 0.05 * np.abs(v).sum(axis=1)
+    work = float((0.5 * (power[1:] + power[:-1]) * np.diff(times)).sum())
+    data = mechanism.model.createData()
+    energies = [
+        pin.computeMechanicalEnergy(mechanism.model, data, run.q[i], run.v[i]) for i in (0, -1)
+    ]
+    assert energies[0] - energies[1] == pytest.approx(work, rel=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -189,3 +189,26 @@ def test_slow_motions_are_right_anywhere(rate: float, tableau: str) -> None:
     for beside, rtol in product(REACHES, TOLERANCES):
         if rate != 0.0 or beside != 0.0:  # else at rest in the equilibrium, on all branches
             check(turning.slow(beside, rate), rtol, tableau=tableau)
+
+
+@on_both
+@pytest.mark.parametrize("singular_tolerance", [1e-9, 0.0])
+@pytest.mark.parametrize("joint", ["crank", "rocker"])
+@pytest.mark.parametrize("rtol", [1e-6, 1e-9])
+def test_equal_bars_that_a_drive_turns_back_have_no_residual(
+    backend: str, joint: str, rtol: float, singular_tolerance: float
+) -> None:
+    """The drive turns back on the change point: Newton's steps for the critical configuration
+    only halve the distance there, and end far from it."""
+    start = np.array([1.0, -1.0, 1.0])
+    driven = replace(load("parallelogram"), drives=(srm.Drive(srm.Sine(1.0, omega=3.0), joint),))
+    driven = driven.with_state(start, 3.0 * start)
+
+    run = srm.simulate(
+        driven, 2.0, rtol=rtol, singular_tolerance=singular_tolerance, backend=backend
+    )
+
+    assert np.abs(run.q - np.outer(1.0 + np.sin(3.0 * run.t), start)).max() < 1e-8
+    assert "residual" not in run.message
+    assert "turned back" in run.message
+    assert " 0 branches" not in run.message

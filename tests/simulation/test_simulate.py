@@ -462,3 +462,26 @@ def test_messages_name_late_times_with_all_their_digits() -> None:
         srm.simulate(mechanism, 1000003.0, t0=1e6, t_eval=[1000004.0])
     with pytest.raises(srm.InputError, match="ends at 1000003 s, before it starts at 1000004 s"):
         srm.simulate(mechanism, 1000003.0, t0=1000004.0)
+    event = srm.Event(lambda t, q, v: t - 1000002.25, terminal=True)
+    for run in (
+        srm.simulate(mechanism, 1000003.5, t0=1e6),
+        srm.simulate(mechanism, 1000005.0, t0=1e6, events=event),
+    ):
+        assert f"t = {run.t[-1]:.10g} s" in run.message
+        assert f"t=1000000..{run.t[-1]:.10g} s" in repr(run)
+
+
+@pytest.mark.parametrize("t0", [0.0, 1.0, 1e9])
+@pytest.mark.parametrize(
+    "options", [{}, {"backend": "python"}, {"step": 1e-3}, {"tableau": "rodas5p"}]
+)
+def test_a_run_may_be_as_short_as_the_rounding_of_its_time(
+    four_bar: srm.Mechanism, t0: float, options: dict[str, Any]
+) -> None:
+    for roundings in (1, 2, 5):
+        end = t0 + roundings * np.spacing(t0)
+        run = srm.simulate(four_bar, end, t0=t0, **options)
+        assert run.success, run.message
+        assert run.t[-1] == end
+        moved = run.q[-1] - four_bar.q0
+        np.testing.assert_allclose(moved, (end - t0) * four_bar.v0, rtol=1e-3, atol=2e-15)

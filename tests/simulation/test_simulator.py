@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import pickle
+from dataclasses import replace
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,37 @@ from tests.support.backends import needs_kernel, on_both
 from tests.support.mechanisms import floating_ring
 from tests.support.memory import ON_LINUX, growth
 from tests.support.snapshots import check_messages, refused
+
+
+@on_both
+def test_two_threads_do_not_use_one_simulator_at_once(backend: str) -> None:
+    inside, go_on = Event(), Event()
+
+    def wait(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        if t > 0.0:
+            inside.set()
+            go_on.wait(10.0)
+        return np.zeros(3)
+
+    mechanism = replace(srm.load("four_bar"), forces=(srm.UserForce(wait, name="wait"),))
+    simulator = srm.Simulator(mechanism, backend=backend)
+    thread = Thread(target=simulator.step, args=(0.1,))
+    thread.start()
+    assert inside.wait(10.0)
+    for call in (
+        lambda: simulator.step(0.1),
+        simulator.reset,
+        simulator.set_state,
+        simulator.clone,
+    ):
+        with pytest.raises(srm.InputError, match="another thread uses this simulator"):
+            call()
+    go_on.set()
+    thread.join()
+    alone = srm.Simulator(mechanism, backend=backend)
+    alone.step(0.1)
+    np.testing.assert_array_equal(simulator.q, alone.q)
+    assert simulator.clone().t == simulator.t
 
 
 @pytest.fixture(scope="module")
@@ -298,6 +331,21 @@ def test_other_methods_run_on_the_reference(slider_crank: srm.Mechanism) -> None
         simulator.step(0.01)
     exact = srm.simulate(slider_crank, 0.1, rtol=1e-10)
     assert np.abs(simulator.q - exact.q[-1]).max() < 1e-5
+
+
+def test_a_reset_to_another_time_needs_a_state_that_follows_the_drives() -> None:
+    four_bar = srm.load("four_bar")
+    driven = replace(four_bar, drives=(srm.Drive(srm.ConstantSpeed(6.0), "crank"),))
+    start = srm.assemble(driven, driven.q0)
+    driven = driven.with_state(start.q, start.v)
+    run = srm.simulate(driven, 0.7, rtol=1e-10)
+    simulator = srm.Simulator(driven, rtol=1e-10)
+
+    with pytest.raises(srm.InputError, match="violates the drives: row crank"):
+        simulator.reset(t=1e-3)
+    simulator.reset(*run(0.4), t=0.4)
+
+    np.testing.assert_allclose(simulator.step(0.3)[0], run.q[-1], rtol=0.0, atol=1e-9)
 
 
 def test_joints_of_many_degrees_are_stepped() -> None:

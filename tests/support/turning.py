@@ -136,6 +136,37 @@ def lifted(reach: float) -> Motion:
     return Motion(_parallelogram(-TOP, rate), 3.0, exact)
 
 
+REST = -0.3
+"""Angle (rad) of the crank at which the springs of :func:`sprung` are at rest."""
+
+
+def sprung(reach: float, stiffness: float, damping: float) -> Motion:
+    """Springs and dampers on all joints of the parallelogram, of ``stiffness`` (N m/rad) and
+    ``damping`` (N m s/rad) on its crank, turn it back at ``reach`` in the middle of the run."""
+    springs, dampers = np.array([1.0, 0.05, 0.1]), np.array([1.0, 0.1, 0.3])
+
+    def field(t: float, y: Any) -> list[float]:
+        torque = -springs.sum() * stiffness * (y[0] - REST) - dampers.sum() * damping * y[1]
+        return [y[1], (torque - 3.0 * G * np.cos(y[0])) / (8.0 / 3.0)]
+
+    def back(t: float, y: Any) -> list[float]:
+        return [-x for x in field(t, y)]
+
+    half = min(0.4, 1.2 / np.sqrt(springs.sum() * stiffness / (8.0 / 3.0)))
+    start = _solved(back, [reach, 0.0], np.array([0.0, half]))[:, -1]
+    mechanism = _parallelogram(start[0], start[1])
+    forces = tuple(
+        srm.TorsionSpring(name, stiffness=k * stiffness, damping=c * damping, rest_angle=REST * w)
+        for name, w, k, c in zip(mechanism.model.names[1:], ALIKE, springs, dampers)
+    )
+
+    def exact(t: Any) -> tuple[np.ndarray, np.ndarray]:
+        angle, speed = _solved(field, start, t)
+        return np.outer(angle, ALIKE), np.outer(speed, ALIKE)
+
+    return Motion(replace(mechanism, forces=forces), 2.0 * half, exact)
+
+
 CART = 2.0
 """Mass (kg) of the cart of :func:`on_a_cart`."""
 

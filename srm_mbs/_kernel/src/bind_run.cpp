@@ -282,7 +282,8 @@ struct PyRun {
             if (!(first > 0.0))
                 first = initial_step(s, norm, t0, start.data(), memory.rate.data(),
                                      memory.state_scale.data(), t_end - t0,
-                                     scheme.controller_order, constants);
+                                     scheme.controller_order, constants,
+                                     intervals.ends.front() - t0);
             control = std::make_unique<PIControl>(t_end, first, scheme.controller_order,
                                                   stiff.controller_order, constants);
         }

@@ -153,6 +153,13 @@ bool BranchNodes::solve(double t, const double* from, const std::vector<double>&
     std::copy(state.end() - nv_, state.end(), rate.begin());
     double* const acceleration = rate.data() + nv_;
     system_.free_acceleration(acceleration);
+    // What closures leave of the forces of joined laws, F - M P M^-1 F, is smooth on the branch.
+    const std::vector<double>* const joined = system_.joined_laws();
+    laws = joined ? *joined : system_.law_values();
+    if (joined) {
+        by_laws_.resize(nv_);
+        system_.acceleration_by(joined->data(), by_laws_.data());
+    }
     std::fill(multiplier.begin(), multiplier.end(), 0.0);
     std::fill(change_.begin(), change_.end(), 0.0);
     double size = 0.0;
@@ -164,6 +171,10 @@ bool BranchNodes::solve(double t, const double* from, const std::vector<double>&
         system_.multiplier_of(acceleration, own);
         add(value[k], own, multiplier.data(), nv_);
         add(value[k] - coarse[k], own, change_.data(), nv_);
+        if (!joined) continue;
+        system_.normal_part(by_laws_.data(), closing_.data());
+        system_.mass_times(closing_.data(), step_.data());
+        add(-value[k], step_.data(), laws.data(), nv_);
     }
     size += system_.position_norm(multiplier.data());
     if (!(system_.position_norm(change_.data()) <= constants_.node_misfit * size)) return false;

@@ -37,7 +37,7 @@ private:
     // Of the nodes (count, nv): positions, motions onto the closures, rates off the branch,
     // multipliers.
     std::vector<double> nodes_, closings_, off_, multipliers_;
-    std::vector<double> point_, step_, closing_, change_, allowed_, residuals_, basis_;
+    std::vector<double> point_, step_, closing_, change_, allowed_, residuals_, basis_, by_laws_;
 };
 
 }  // namespace srm

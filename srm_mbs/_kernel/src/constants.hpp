@@ -61,6 +61,8 @@ namespace srm {
     field(double, layer_approached)        /* rate of steps whose stages miss one, over the first */ \
     field(double, layer_unresolved)        /* change of a rate that misses one (layers) */         \
     field(double, difference)              /* by a coordinate, over its size */                    \
+    field(double, central_difference)      /* the same, central */                                 \
+    field(double, friction_difference)     /* of a rate, over the speed of friction, at most */    \
     field(double, time_difference)         /* by time, over the step */                            \
     field(double, shortest_difference)     /* by time (roundings of t) */                          \
     /* Step-size control: control/step_size.py. */                                                 \
@@ -76,6 +78,9 @@ namespace srm {
     field(double, first_step_probe)        /* relative change that the first step may make */      \
     field(double, longest_first_step)      /* over the probing step */                             \
     field(double, at_rest)                 /* change of rates at rest, over the probing step */    \
+    field(double, rest_probe_late)         /* parts of the interval at which */                    \
+    field(double, rest_probe_early)        /* the end of a rest shows */                           \
+    field(double, rest_ends)               /* change of the rates there */                         \
     field(double, rest_factor)             /* of the times at which its end is looked for */       \
     field(double, clock_rounding)          /* of the end of a step, over its length, that counts */ \
     /* Placement: control/placement.py. */                                                         \
@@ -107,7 +112,8 @@ namespace srm {
     /* Critical configurations: singularities/critical.py, critical_passages.py. */                \
     field(int, critical_iterations)                                                                \
     field(double, critical_difference)     /* step of the differences of G^T u (units) */          \
-    field(double, critical_accepted)       /* size of the equations: the residual is known */      \
+    field(double, critical_decided)        /* size of the equations: a zero residual is known */   \
+    field(double, critical_accepted)       /* that from which the search has failed */             \
     field(double, critical_converged)      /* and that at rounding */                              \
     field(double, critical_frozen)         /* step up to which the Hessian is kept (units) */      \
     field(double, critical_ridge)          /* added to the Hessian's diagonal */                   \

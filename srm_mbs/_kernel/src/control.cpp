@@ -124,8 +124,7 @@ StagePlaces::StagePlaces(const ButcherTableau& scheme, double clearance, double 
     : gaps(scheme, clearance),
       abscissae(with_end(scheme)),
       middle(0),
-      slope_from(slope_from),
-      explicit_scheme(scheme.implicit.empty()) {
+      slope_from(slope_from) {
     for (std::size_t k = 1; k < abscissae.size(); ++k)
         if (std::abs(abscissae[k] - 0.5) < std::abs(abscissae[middle] - 0.5))
             middle = static_cast<int>(k);
@@ -174,7 +173,7 @@ Proposal SingularityPlacement::propose(double t, double limit, IntegratorState& 
 // Whether stages next to a singular configuration are to be solved by nodes of the branch: the
 // motion turns back, is slow or ends there.
 bool SingularityPlacement::lingers(const Proposal& proposal, const IntegratorState& memory) const {
-    if (!places_->explicit_scheme || lost_branch_ || !memory.history) return false;
+    if (lost_branch_ || !memory.history) return false;
     if (memory.history->known_until >= proposal.t_new) return false;
     if (!adaptive) return !memory.history->away.empty();
     if (arrival_ == Arrival::due) return true;

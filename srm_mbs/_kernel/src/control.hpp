@@ -166,7 +166,6 @@ struct StagePlaces {
     std::vector<double> abscissae;
     int middle;         // stage next to the middle of the step
     double slope_from;  // least abscissa by which sigma has a slope
-    bool explicit_scheme;
 };
 
 // `stiff`: the scheme where the problem is stiff.

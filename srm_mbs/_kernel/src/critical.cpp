@@ -91,13 +91,13 @@ public:
         choose_rows();
         take_rows();
         moved_.assign(n_, 0.0);
-        return start() && iterate(constants_.critical_accepted);
+        return start() && iterate(constants_.critical_decided) < constants_.critical_decided;
     }
 
-    // Completes `found`, to rounding, and by the Hessian there.
+    // Completes `found`, to rounding, and by the Hessian there; whether the equations hold.
     bool complete() {
         go_back();
-        iterate(constants_.critical_converged);
+        if (!(iterate(constants_.critical_converged) < constants_.critical_accepted)) return false;
         go_back();
         if (!differentiate(true)) return false;
         found.hessian = hessian_;
@@ -108,9 +108,9 @@ public:
     CriticalConfiguration found;
 
 private:
-    // Newton's iteration from (q, u) until the equations are smaller than `converged`; whether they
-    // hold.
-    bool iterate(double converged) {
+    // Newton's iteration from (q, u) until the equations are smaller than `converged`; their size,
+    // infinite where it fails.
+    double iterate(double converged) {
         const int size = n_ + rank_ + 1;
         std::vector<double> value(size), matrix;
         double best = infinity;
@@ -126,15 +126,15 @@ private:
                 found.u = u_;
             }
             if (error <= converged) break;
-            if (last_move_ > constants_.critical_frozen && !differentiate()) return false;
+            if (last_move_ > constants_.critical_frozen && !differentiate()) return infinity;
             fill_matrix(matrix);
             for (double& v : value) v = -v;
-            if (!solve(matrix, value)) return false;
+            if (!solve(matrix, value)) return infinity;
             last_move_ = largest(value.data(), n_);
-            if (!(last_move_ < constants_.critical_reach)) return false;
+            if (!(last_move_ < constants_.critical_reach)) return infinity;
             closures_.move(value.data(), x_, time_);
             add(1.0, value.data(), moved_.data(), n_);
-            if (!(largest(moved_.data(), n_) < constants_.critical_reach)) return false;
+            if (!(largest(moved_.data(), n_) < constants_.critical_reach)) return infinity;
             add(1.0, value.data() + n_, u_.data(), rank_);
             const double length = norm(u_.data(), rank_);
             for (double& u : u_) u /= length;
@@ -142,7 +142,7 @@ private:
             take_rows();
             delta_ = dot(u_.data(), g_.data(), rank_);
         }
-        return best < constants_.critical_accepted;
+        return best;
     }
 
     void go_back() {

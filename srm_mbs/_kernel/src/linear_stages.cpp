@@ -54,14 +54,14 @@ LinearStages::LinearStages(System& system, double gamma, std::vector<double> uni
 void LinearStages::prepare(double t, double h, const double* state,
                            const std::vector<double>& rate,
                            const std::vector<double>& state_scale,
-                           const std::vector<double>& laws, const System::ZoneView& zone,
-                           bool on_branch) {
-    const bool same = known_ && known_time_ == t && on_branch_ == on_branch &&
-                      known_rate_ == rate && known_laws_ == laws &&
+                           const std::vector<double>& laws, const Places& places) {
+    const bool lingers = static_cast<bool>(places.by_nodes);
+    const bool same = known_ && known_time_ == t && on_branch_ == places.on_branch &&
+                      lingers_ == lingers && known_rate_ == rate && known_laws_ == laws &&
                       std::equal(known_state_.begin(), known_state_.end(), state);
     if (!same) {
         known_ = false;
-        linearise(t, h, state, state_scale, laws, zone, on_branch);
+        linearise(t, h, state, state_scale, laws, places);
         known_time_ = t;
         known_rate_ = rate;
         known_laws_ = laws;
@@ -73,25 +73,27 @@ void LinearStages::prepare(double t, double h, const double* state,
 
 void LinearStages::linearise(double t, double h, const double* state,
                              const std::vector<double>& state_scale,
-                             const std::vector<double>& laws, const System::ZoneView& zone,
-                             bool on_branch) {
+                             const std::vector<double>& laws, const Places& places) {
     const int nv = nv_, n = n_, m = count_;
-    on_branch_ = on_branch;
+    on_branch_ = places.on_branch;
+    lingers_ = static_cast<bool>(places.by_nodes);
     if (!laws.empty()) expect_size("laws", laws.size(), static_cast<std::size_t>(m));
     // The rate of the memory is the one before the last correction, which stiff forces notice.
     system_.apply_laws(laws.empty() ? nullptr : laws.data());
-    rate_at(t, state, zone, rate_);
-    laws_ = system_.law_values();
+    const bool solved = rate_at(t, state, places, rate_);
+    laws_ = laws_there_;
     applied_ = laws.empty() ? laws_ : laws;
     system_.apply_laws(m ? applied_.data() : nullptr);
     std::vector<double> steps(n);
     for (int j = 0; j < n; ++j)
         steps[j] = rounded_down(constants_.difference * std::max(unit_[j], state_scale[j]));
     std::fill(delta_.begin(), delta_.end(), 0.0);
-    whole_ = on_branch && !system_.rank_deficient();
+    whole_ = solved || (on_branch_ && !system_.rank_deficient());
     if (whole_) {
-        system_.law_accelerations(W_.data());
-        along_branch(t, state, steps, zone);
+        if (lingers_) widen(state_scale, steps);
+        if (!solved) system_.law_accelerations(W_.data());
+        along_branch(t, state, steps, solved, places);
+        if (solved) by_applied_laws(t, state, places);
     } else if (system_.linearise(t, state, &rate_[nv], steps, C_.data(), D_.data(), W_.data(),
                                  L_.data())) {
         chart_by_coordinates(steps);
@@ -100,7 +102,7 @@ void LinearStages::linearise(double t, double h, const double* state,
         if (system_.derivatives(state, &rate_[nv], A_.data(), C_.data(), D_.data()))
             by_forces(t, state, steps);
         else
-            by_differences(t, state, steps, zone);
+            by_differences(t, state, steps, places);
     }
     for (int j = 0; j < n; ++j) {
         double* const column = whole_   ? &J_[j * n + nv]
@@ -114,33 +116,43 @@ void LinearStages::linearise(double t, double h, const double* state,
     const double spacing = std::nextafter(std::abs(t), infinity) - std::abs(t);
     const double tau = rounded_down(
         std::max(constants_.time_difference * h, constants_.shortest_difference * spacing));
-    rate_at(t + tau, state, zone, probe_);
-    rate_at(t + 2.0 * tau, state, zone, other_);
+    rate_at(t + tau, state, places, probe_);
+    rate_at(t + 2.0 * tau, state, places, other_);
     for (int i = 0; i < n; ++i)
         by_time_[i] = (4.0 * (probe_[i] - rate_[i]) - (other_[i] - rate_[i])) / (2.0 * tau);
 }
 
-// On the branch at the projection of `state`.
-void LinearStages::rate_at(double t, const double* state, const System::ZoneView& zone,
+// On the branch at the projection of `state`; whether nodes solved it.
+bool LinearStages::rate_at(double t, const double* state, const Places& places,
                            std::vector<double>& out) {
-    system_.evaluate(t, state, zone);
+    system_.evaluate(t, state, lingers_ ? System::ZoneView{} : places.zone);
+    if (lingers_ && system_.sigma() < constants_.branch_below) {
+        if (const StageOnBranch* const stage = places.by_nodes(t, state)) {
+            out = stage->rate;
+            laws_there_ = stage->laws;
+            return true;
+        }
+        system_.evaluate(t, state, places.zone);
+    }
     if (on_branch_ && !system_.rank_deficient()) {
         system_.correction(work_.data());
         for (double& x : work_) x = -x;
         system_.retract(state, work_.data(), x_.data());
-        system_.evaluate(t, x_.data(), zone);
+        system_.evaluate(t, x_.data(), places.zone);
     }
     system_.rate(out.data());
+    laws_there_ = system_.law_values();
+    return false;
 }
 
 // B, C and D with the laws held, and L, from differences of rates.
 void LinearStages::by_differences(double t, const double* state, const std::vector<double>& steps,
-                                  const System::ZoneView& zone) {
+                                  const Places& places) {
     const int nv = nv_, n = n_, m = count_;
     for (int j = 0; j < n; ++j) {
         const double step = delta_[j] = steps[j];
         system_.retract(state, delta_.data(), x_.data());
-        rate_at(t, x_.data(), zone, probe_);
+        rate_at(t, x_.data(), places, probe_);
         const bool position = j < nv;
         if (position) {
             system_.chart_rate(delta_.data(), probe_.data(), other_.data());
@@ -148,36 +160,75 @@ void LinearStages::by_differences(double t, const double* state, const std::vect
         }
         double* const column = position ? &C_[j * nv] : &D_[(j - nv) * nv];
         for (int i = 0; i < nv; ++i) column[i] = (probe_[nv + i] - rate_[nv + i]) / step;
-        for (int k = 0; k < m; ++k) L_[j * m + k] = (system_.law_values()[k] - laws_[k]) / step;
+        for (int k = 0; k < m; ++k) L_[j * m + k] = (laws_there_[k] - laws_[k]) / step;
         delta_[j] = 0.0;
     }
 }
 
+// The steps of central differences, over which friction does not change much.
+void LinearStages::widen(const std::vector<double>& state_scale, std::vector<double>& steps) const {
+    const double slow = system_.friction_sums().empty()
+                            ? infinity
+                            : constants_.friction_difference * system_.friction_speed();
+    for (int j = 0; j < n_; ++j) {
+        const double size = constants_.central_difference * std::max(unit_[j], state_scale[j]);
+        steps[j] = std::max(steps[j], rounded_down(j < nv_ ? size : std::min(size, slow)));
+    }
+}
+
 // J with the laws held, and L, along the branch: off it the rates are those of its nearest place, and
-// their derivatives along the normals are zero.
+// their derivatives along the normals are zero.  Nodes project onto the branch by themselves; where
+// the motion lingers differences are central, because nodes round to 1e-13 only.
 void LinearStages::along_branch(double t, const double* state, const std::vector<double>& steps,
-                                const System::ZoneView& zone) {
+                                bool solved, const Places& places) {
     const int nv = nv_, n = n_, m = count_;
     J_.resize(static_cast<std::size_t>(n) * n);
     std::vector<double> tangents(static_cast<std::size_t>(nv) * nv, 0.0), normal(nv);
     for (int j = 0; j < nv; ++j) {
         double* const tangent = &tangents[static_cast<std::size_t>(j) * nv];
         tangent[j] = 1.0;
+        if (solved) continue;
         system_.normal_part(tangent, normal.data());
         add(-1.0, normal.data(), tangent, nv);
     }
     std::vector<double> delta(n), moved(x_.size());
-    for (int j = 0; j < n; ++j) {
+    // Chart rates in probe_, and laws, at `step` along the direction j.
+    const auto probe = [&](int j, double step) {
         const int first = j < nv ? 0 : nv;
         std::fill(delta.begin(), delta.end(), 0.0);
-        add(steps[j], &tangents[static_cast<std::size_t>(j - first) * nv], &delta[first], nv);
+        add(step, &tangents[static_cast<std::size_t>(j - first) * nv], &delta[first], nv);
         system_.retract(state, delta.data(), moved.data());
-        rate_at(t, moved.data(), zone, probe_);
+        rate_at(t, moved.data(), places, probe_);
         system_.chart_rate(delta.data(), probe_.data(), other_.data());
+        std::copy_n(other_.begin(), nv, probe_.begin());
+    };
+    std::vector<double> rate, laws;
+    for (int j = 0; j < n; ++j) {
         double* const column = &J_[static_cast<std::size_t>(j) * n];
-        for (int i = 0; i < n; ++i)
-            column[i] = ((i < nv ? other_[i] : probe_[i]) - rate_[i]) / steps[j];
-        for (int k = 0; k < m; ++k) L_[j * m + k] = (system_.law_values()[k] - laws_[k]) / steps[j];
+        double apart = steps[j];
+        if (lingers_) {
+            probe(j, -apart);
+            rate = probe_;
+            laws = laws_there_;
+        }
+        probe(j, apart);
+        if (lingers_) apart *= 2.0;
+        const std::vector<double>&from = lingers_ ? rate : rate_, &before = lingers_ ? laws : laws_;
+        for (int i = 0; i < n; ++i) column[i] = (probe_[i] - from[i]) / apart;
+        for (int k = 0; k < m; ++k) L_[j * m + k] = (laws_there_[k] - before[k]) / apart;
+    }
+}
+
+// W where nodes solve the stage: accelerations are linear in what acts in place of the laws.
+void LinearStages::by_applied_laws(double t, const double* state, const Places& places) {
+    const double change = std::max(1.0, largest(applied_.data(), count_));
+    for (int k = 0; k < count_; ++k) {
+        const double own = applied_[k];
+        applied_[k] += change;
+        rate_at(t, state, places, probe_);
+        applied_[k] = own;
+        for (int i = 0; i < nv_; ++i)
+            W_[k * nv_ + i] = (probe_[nv_ + i] - rate_[nv_ + i]) / change;
     }
 }
 
@@ -294,7 +345,7 @@ void LinearStages::solve(double* x, const double* laws, const double* applied,
         }
     }
     for (int k = 0; k < m; ++k) law_rates[k] = (laws[k] - applied[k]) / k_;
-    for (int j = 0; j < n_; ++j) add(x[j], &L_[j * m], law_rates, m);
+    for (int j = 0; j < n_; ++j) add(x[j], L_.data() + j * m, law_rates, m);
 }
 
 void LinearStages::multiply(const std::vector<double>& x, std::vector<double>& out) const {

@@ -104,7 +104,21 @@ void Run::enter_interval() {
 bool Run::enter() {
     ++interval_;
     enter_interval();
-    return restart_after_break();
+    const bool accurate = restart_after_break();
+    rest_limit_ = longest_from_rest();
+    return accurate;
+}
+
+// longest_from_rest() in control/step_size.py.
+double Run::longest_from_rest() const {
+    if (!system.driven()) return infinity;
+    std::vector<double> weights(memory.rate.size());
+    for (std::size_t i = 0; i < weights.size(); ++i)
+        weights[i] = step.norm.weight(static_cast<int>(i), memory.state_scale[i]);
+    const double ahead = intervals_.ends[interval_] - t_;
+    const double moved = ahead * ErrorNorm::ratio(memory.rate.data(), weights.data(),
+                                                  static_cast<int>(weights.size()));
+    return moved < step.norm.negligible ? constants().rest_probe_early * ahead : infinity;
 }
 
 // Records a break of the rates at t, and evaluates the first stage after it; whether it is accurate.
@@ -188,6 +202,8 @@ void Run::resume(double t, const std::vector<double>& from, IntegratorState know
     passage_.reset();
     memory = std::move(known);
     control->resume(known_control);
+    const bool enters = interval_ > 0 && t == ends[interval_ - 1];
+    rest_limit_ = enters ? longest_from_rest() : infinity;
 }
 
 RunSnapshot Run::snapshot() const {
@@ -224,7 +240,7 @@ Stop Run::attempt(StepDecision& decision) {
         if (!restart_interval()) return Stop::breakpoint;
     }
     const double limit =
-        std::min({max_step_, system.step_limit(state.data()), jump_limit_});
+        std::min({max_step_, system.step_limit(state.data()), jump_limit_, rest_limit_});
     const Proposal proposal = control->propose(t_, limit, memory);
     if (proposal.arriving) return Stop::arrival;
     const double h = h_ = proposal.h;
@@ -233,8 +249,10 @@ Stop Run::attempt(StepDecision& decision) {
         const bool due = !known_ && zero > t_ && memory.sigma < examine_below_;
         if (due && (one_freedom_ || !quiet_) && examine(zero)) return make_prepared();
     }
+    // The end of the run, or of an interval, may be as close as that.
     const double spacing = std::nextafter(std::abs(t_), infinity) - std::abs(t_);
-    if (!(h > std::max(smallest_, 4.0 * spacing))) return Stop::too_short;
+    if (!(h > std::max(smallest_, 4.0 * spacing)) && proposal.t_new != intervals_.ends[interval_])
+        return Stop::too_short;
     const int steps = constants().standstill_steps;
     if (made_ >= steps && made_ % steps == 0 &&
         t_ - watched_time_ < constants().standstill * (t_end() - t0_))
@@ -274,7 +292,7 @@ Stop Run::attempt(StepDecision& decision) {
         records.zones.push_back({records.count(), result->zone_threshold, *memory.history});
     record(*result, proposal.t_new, placement);
     const bool jumped = on_jump_;
-    jump_limit_ = infinity;
+    jump_limit_ = rest_limit_ = infinity;
     jump_tries_ = 0;
     on_jump_ = false;
     inaccurate_ = jumped && t_ < interval_end() && !restart_after_break();

@@ -183,6 +183,7 @@ private:
     bool restart_after_break();
     bool restart_interval();
     double direct_from() const;
+    double longest_from_rest() const;
 
     const Constants& constants() const { return step.constants; }
     SplitStep& stepper();
@@ -204,6 +205,7 @@ private:
     double watched_time_ = 0.0;
     // The search for the end of a step on a jump of forces: JumpSearch in driver.py.
     double jump_limit_ = infinity;
+    double rest_limit_ = infinity;  // of the step that leaves a rest at a breakpoint
     int jump_tries_ = 0;
     bool on_jump_ = false;
     bool inaccurate_ = false;  // the first stage after a jump: Python has to look at it

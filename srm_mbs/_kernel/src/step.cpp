@@ -46,7 +46,8 @@ double ErrorNorm::ratio(const double* error, const double* weights, int n) {
 // tolerance.
 double initial_step(System& system, const ErrorNorm& norm, double t, const double* state,
                     const double* rate, const double* state_scale, double span, int order,
-                    const Constants& constants) {
+                    const Constants& constants, double smooth) {
+    smooth = std::min(smooth, span);
     const int n = 2 * system.nv;
     std::vector<double> weights(n), error(n), there(n), probed(n), x(system.nq + system.nv);
     for (int i = 0; i < n; ++i) {
@@ -58,8 +59,8 @@ double initial_step(System& system, const ErrorNorm& norm, double t, const doubl
         throw EvaluationError{Failure::not_finite};
     const double d1 = ErrorNorm::ratio(rate, weights.data(), n);
     if (!std::isfinite(d1)) throw EvaluationError{Failure::not_finite};
-    if (!(d1 > 0.0)) return constants.first_step_probe * span;
-    const double h0 = std::min(constants.first_step_probe * d0 / d1, span);
+    if (!(d1 > 0.0)) return constants.first_step_probe * smooth;
+    double h0 = std::min(constants.first_step_probe * d0 / d1, span);
     // Size of the change of the rates over `ahead` (s), with the state moving on or not.
     const auto change = [&](double ahead, double moves) {
         for (int i = 0; i < n; ++i) error[i] = moves * ahead * rate[i];
@@ -70,9 +71,19 @@ double initial_step(System& system, const ErrorNorm& norm, double t, const doubl
         for (int i = 0; i < n; ++i) probed[i] -= rate[i];
         return ErrorNorm::ratio(probed.data(), weights.data(), n);
     };
-    const double d2 = change(h0, 1.0) / h0;
+    double d2 = change(h0, 1.0) / h0;
     if (!std::isfinite(d2)) throw EvaluationError{Failure::not_finite};
     const double longest = constants.longest_first_step * h0;
+    if (h0 == span) {
+        // A drive that moves smoothly from rest to rest has the rates of its start at its end.
+        for (const double part : {constants.rest_probe_late, constants.rest_probe_early}) {
+            const double ahead = part * smooth, changed = change(ahead, 0.0);
+            if (changed > constants.rest_ends * d2 * h0) {
+                h0 = ahead;
+                d2 = changed / ahead;
+            }
+        }
+    }
     if (!(d2 > 0.0)) return std::min(longest, span);
     double tau = d1 / d2, faster = d1;
     if (tau < constants.at_rest * h0 && change(h0, 0.0) > 0.5 * h0 * d2) {
@@ -160,7 +171,7 @@ void SplitStep::apply_laws(int j) {
     applied_ = linear_->applied();
     const double* a = j < s ? &scheme.A[j * s] : scheme.b.data();
     for (int k = scheme.lead; k < j; ++k)
-        if (a[k] != 0.0) add(h_ * a[k], &law_rates_[k * m], applied_.data(), m);
+        if (a[k] != 0.0) add(h_ * a[k], law_rates_.data() + k * m, applied_.data(), m);
     system_.apply_laws(j < s && m ? applied_.data() : nullptr);
 }
 
@@ -168,14 +179,14 @@ void SplitStep::apply_laws(int j) {
 // laws there.
 void SplitStep::linear_rate(int j, const std::vector<double>& laws) {
     const int s = scheme.stages(), n = n_, m = linear_->count();
-    double *const rate = &result.rates[j * n], *const law_rate = &law_rates_[j * m];
+    double *const rate = &result.rates[j * n], *const law_rate = law_rates_.data() + j * m;
     const double* by_time = linear_->by_time().data();
     std::fill(error_.begin(), error_.end(), 0.0);
     std::fill(law_shares_.begin(), law_shares_.end(), 0.0);
     for (int k = scheme.lead; k < j; ++k) {
         const double weight = linear_weights_[j * s + k];
         add(weight, &result.rates[k * n], error_.data(), n);
-        add(weight, &law_rates_[k * m], law_shares_.data(), m);
+        add(weight, law_rates_.data() + k * m, law_shares_.data(), m);
     }
     const double share = h_ * time_shares_[j];
     for (int i = 0; i < n; ++i) rate[i] += error_[i] + share * by_time[i];
@@ -359,13 +370,14 @@ bool SplitStep::solve_on_branch(double t, double start, const double* state,
         known = !away_.empty();
         if (!known) nodes_->find_direction(start, state, away_);
         touches_ = away_.size() > static_cast<std::size_t>(nv_);
-        if (touches_) {
+        if (touches_ && !linear_) {
             if (!touching_) touching_.emplace(system_, constants);
             found = touching_->prepare(start, state, away_);
         }
         if (touches_ || !known) system_.evaluate(t, x_.data(), System::ZoneView{});
     }
-    if (away_.empty() || !found)
+    // Linearly implicit steps have no nodes where branches touch.
+    if (away_.empty() || !found || (touches_ && linear_))
         found = false;
     else if (touches_)
         found = touching_->solve(t, x_.data(), *nodes_);
@@ -447,7 +459,7 @@ const StepResult& SplitStep::make(double t, double h, const double* state,
     h_ = h;
     monitored_ = constrained && memory.sigma < constants.monitored_below +
                                                    constants.far_steps * sigma_change;
-    lingers_ = monitored_ && memory.lingering && theta == 1.0 && !linear_;
+    lingers_ = monitored_ && memory.lingering && theta == 1.0;
     r.stiff = memory.stiff;
     if (monitored_) {
         for (int i = 0; i < n_; ++i) weights_[i] = norm.weight(i, memory.state_scale[i]);
@@ -493,9 +505,17 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
         }
     };
     const Tracking tracking(linear_ ? &system_ : nullptr);
+    noded_ = noded_end_ = r.lost_branch = false;
+    if (lingers_) away_.clear();
     if (linear_) {
-        linear_->prepare(t, h_, state, memory.rate, memory.state_scale, memory.laws,
-                         monitored_ ? branch_.zone : none, monitored_ && branch_.near);
+        LinearStages::Places places;
+        if (monitored_) places = {branch_.zone, branch_.near, {}};
+        if (lingers_)
+            places.by_nodes = [&](double time, const double* x) -> const StageOnBranch* {
+                std::copy_n(x, nx_, x_.begin());
+                return solve_on_branch(time, t, state, memory) ? &*nodes_ : nullptr;
+            };
+        linear_->prepare(t, h_, state, memory.rate, memory.state_scale, memory.laws, places);
         for (int j = 0; j <= scheme.lead; ++j) {
             std::copy_n(linear_->rate().begin(), n, &r.rates[j * n]);
             r.sigmas[j] = memory.sigma;
@@ -507,8 +527,6 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
     r.rank = std::numeric_limits<int>::max();
     r.held = false;
     moved_end_ = false;
-    noded_ = noded_end_ = r.lost_branch = false;
-    if (lingers_) away_.clear();
     for (int j = scheme.lead + 1; j <= s; ++j) {
         const bool end = j == s;
         const double* a = end ? scheme.b.data() : &scheme.A[j * s];
@@ -529,6 +547,7 @@ void SplitStep::evaluate_stages(double t, const double* state, const IntegratorS
                 x_ = nodes_->state;
                 rate_ = nodes_->rate;
                 system_.chart_rate(delta_.data(), rate_.data(), &r.rates[j * n]);
+                if (linear_ && !end) linear_rate(j, nodes_->laws);
                 continue;
             }
             system_.evaluate(time, x_.data(), branch_.zone);

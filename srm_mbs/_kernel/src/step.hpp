@@ -53,7 +53,7 @@ struct ErrorNorm {
 // Length (s) of the first step: initial_step in control/step_size.py.
 double initial_step(System& system, const ErrorNorm& norm, double t, const double* state,
                     const double* rate, const double* state_scale, double span, int order,
-                    const Constants& constants);
+                    const Constants& constants, double smooth);
 
 #define SRM_INTEGRATOR_STATE(field)                                                       \
     field(std::vector<double>, rate)        /* (n,), tangent rate: the next first stage */ \

@@ -1103,6 +1103,12 @@ void System::free_acceleration(double* out) {
     projection_->unwhiten(out);
 }
 
+void System::acceleration_by(const double* f, double* out) const {
+    std::copy_n(f, nv, out);
+    projection_->whiten_force(out);
+    projection_->unwhiten(out);
+}
+
 void System::impulse_response(const double* q, const double* n, double* along, double* free) {
     auto& w = *work_;
     w.place(q);

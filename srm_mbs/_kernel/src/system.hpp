@@ -334,6 +334,13 @@ public:
     }
     void apply_laws(const double* values) { laws_.applied = values; }
     const std::vector<double>& law_values() const { return laws_.values; }
+    // Of joined laws that are tracked, their generalised forces (nv,) at the stage evaluated last;
+    // null of others.
+    const std::vector<double>* joined_laws() const {
+        return tracks_laws_ && !joined_.empty() ? &joined_ : nullptr;
+    }
+    // M^-1 f (nv,).
+    void acceleration_by(const double* f, double* out) const;
     // Derivatives (nv, count) of the accelerations by the laws that act, at the stage evaluated last.
     void law_accelerations(double* out);
     // Number of the law of a coordinate, or -1.

@@ -9,9 +9,10 @@
 namespace srm {
 
 // A stage on its branch: its state (nx,), tangent rate (2 nv,) and multiplier (nv,), what was
-// subtracted from the stage (2 nv,), and the direction of the branch there (nv,), or its frame.
+// subtracted from the stage (2 nv,), and the direction of the branch there (nv,), or its frame; where
+// the system tracks them, and branches cross, the laws of forces (m,).
 struct StageOnBranch {
-    std::vector<double> state, rate, multiplier, moved, away;
+    std::vector<double> state, rate, multiplier, moved, away, laws;
 };
 
 class TouchingBranch {

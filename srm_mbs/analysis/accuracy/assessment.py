@@ -16,6 +16,7 @@ from srm_mbs.analysis.accuracy.error_estimate import (
     ErrorEstimate,
     Trial,
 )
+from srm_mbs.errors import time_text
 from srm_mbs.integration.methods.thesis.regularisation import parse_eps
 from srm_mbs.simulation.result import SimulationResult
 
@@ -74,14 +75,16 @@ def assess_status(solution: SimulationResult) -> Assessment:
     topic = "end of the run"
     start, end = solution.span
     if solution.status == "finished":
-        return Assessment(topic, "good", f"It reached its end at t = {end:.6g} s.")
+        return Assessment(topic, "good", f"It reached its end at t = {time_text(end)} s.")
     if solution.status == "event":
-        return Assessment(topic, "good", f"An event ended it at t = {end:.6g} s, as asked.")
+        return Assessment(topic, "good", f"An event ended it at t = {time_text(end)} s, as asked.")
     word = "was interrupted" if solution.status == "interrupted" else "failed"
     if end <= start:
         return Assessment(topic, "poor", f"It {word} at its start: there is no motion to judge.")
-    asked = "" if solution.request is None else f" of {solution.request.t_end:.6g} s"
-    text = f"It {word} at t = {end:.6g} s{asked}; all assessments refer to the time until then."
+    asked = "" if solution.request is None else f" of {time_text(solution.request.t_end)} s"
+    text = (
+        f"It {word} at t = {time_text(end)} s{asked}; all assessments refer to the time until then."
+    )
     return Assessment(topic, "poor", text)
 
 
@@ -151,8 +154,8 @@ def _error(solution: SimulationResult, estimate: ErrorEstimate) -> tuple[Grade, 
     if estimate.branch is not None:
         return "poor", (
             f"The run and the comparison run pass the singular configuration at "
-            f"t = {estimate.branch:.6g} s on different branches, and are different motions from "
-            "there: at least one of them is wrong; the comparison does not show which."
+            f"t = {time_text(estimate.branch)} s on different branches, and are different motions "
+            "from there: at least one of them is wrong; the comparison does not show which."
         )
     if estimate.apart is not None:
         return "poor", (
@@ -169,13 +172,13 @@ def _error(solution: SimulationResult, estimate: ErrorEstimate) -> tuple[Grade, 
     end = min(solution.span[1], float(estimate.comparison.t[-1]))
     if not estimate.comparison.largest:
         return grade, (
-            f"The comparison run has the same numbers up to t = {end:.6g} s: the mechanism rests, "
-            "or samples, breakpoints or max_step bound the steps of both, which then meet the "
-            "tighter tolerance as well."
+            f"The comparison run has the same numbers up to t = {time_text(end)} s: the mechanism "
+            "rests, or samples, breakpoints or max_step bound the steps of both, which then meet "
+            "the tighter tolerance as well."
         )
     return grade, (
-        f"No joint is off by more than about {sizes} up to t = {end:.6g} s. This is an estimate, "
-        "the difference to a tighter run, and no proven bound."
+        f"No joint is off by more than about {sizes} up to t = {time_text(end)} s. This is an "
+        "estimate, the difference to a tighter run, and no proven bound."
     )
 
 

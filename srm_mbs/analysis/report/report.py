@@ -21,7 +21,7 @@ from srm_mbs.analysis.report.sections import (
     pictures_data,
     run_data,
 )
-from srm_mbs.errors import InputError, __version__, known_names, safe_repr
+from srm_mbs.errors import InputError, __version__, known_names, safe_repr, time_text
 from srm_mbs.formats.files import checked_path, utf8
 from srm_mbs.model.numbers import flag, name_list
 from srm_mbs.simulation.result import SimulationResult
@@ -153,7 +153,7 @@ def _summary(solution: SimulationResult, certificate: Certificate) -> list[str]:
     shown = [estimate] if worst.grade == estimate.grade else [worst, estimate]
     return [
         f"Mechanism: {shape}.",
-        f"Run: {end - start:.6g} s of motion in {steps} steps; {solution.status}.{passed}",
+        f"Run: {time_text(end - start)} s of motion in {steps} steps; {solution.status}.{passed}",
         f"Accuracy, overall {GRADE_LABELS[certificate.grade]}.",
         *(f"{finding.topic.capitalize()}: {finding.text}" for finding in shown),
     ]

@@ -22,7 +22,7 @@ from srm_mbs.analysis.summary import (
     run_rows,
 )
 from srm_mbs.dynamics.mechanism import Mechanism
-from srm_mbs.errors import ControllerError, EvaluationError, InputError
+from srm_mbs.errors import ControllerError, EvaluationError, InputError, time_text
 from srm_mbs.formats.files import file_name
 from srm_mbs.integration.methods.tableaus import TABLEAUS
 from srm_mbs.integration.singular_passages import Crossing
@@ -145,7 +145,7 @@ def mechanism_data(solution: SimulationResult, full_paths: bool) -> dict[str, An
             draw_snapshot(solution, start),
             "image/png",
             f"Drawing of the bodies of {mechanism.name} at the start of the run",
-            f"The mechanism at the start of the run, t = {start:.6g} s.",
+            f"The mechanism at the start of the run, t = {time_text(start)} s.",
         )
     except InputError as error:
         problem = _about(mechanism, error, full_paths)
@@ -206,10 +206,10 @@ def _settings(solution: SimulationResult) -> list[tuple[str, str]]:
     rows = [
         ("method", settings.method),
         ("scheme", f"{settings.tableau}{order}"),
-        ("start", f"{start:.6g} s"),
+        ("start", f"{time_text(start)} s"),
     ]
     if request is not None:
-        rows.append(("end asked for", f"{request.t_end:.6g} s"))
+        rows.append(("end asked for", f"{time_text(request.t_end)} s"))
     if settings.step is not None:
         rows.append(("step", f"{settings.step:.6g} s, fixed"))
     else:
@@ -221,7 +221,7 @@ def _settings(solution: SimulationResult) -> list[tuple[str, str]]:
         ]
     rows.append(("placement of steps", settings.placement))
     if settings.singular_times:
-        times = ", ".join(f"{t:.6g}" for t in settings.singular_times)
+        times = ", ".join(time_text(t) for t in settings.singular_times)
         rows.append(("times that steps avoid", f"{times} s"))
     if settings.controlled:
         rows.append(("controller or forces in Python", "yes"))
@@ -390,7 +390,7 @@ def _estimate(solution: SimulationResult, estimate: ErrorEstimate) -> dict[str, 
                 str(trial.steps),
                 str(trial.evaluations),
                 f"{trial.wall_time:.3g} s",
-                f"{trial.status} at {trial.end:.6g} s",
+                f"{trial.status} at {time_text(trial.end)} s",
                 "tightest" if trial.difference is None else f"{trial.difference:.2e}",
             )
             for trial in estimate.trials
@@ -426,7 +426,10 @@ def _meaning(estimate: ErrorEstimate) -> str:
     if estimate.bound:
         return "The largest difference to the next looser run: the error should be smaller."
     if estimate.apart is not None:
-        return f"The largest difference to the tightest run, up to t = {estimate.apart:.6g} s only."
+        return (
+            f"The largest difference to the tightest run, up to t = "
+            f"{time_text(estimate.apart)} s only."
+        )
     extrapolated = " It is extrapolated to a step of length zero." * estimate.fixed
     return f"The largest difference to the tightest run, over the whole time.{extrapolated}"
 

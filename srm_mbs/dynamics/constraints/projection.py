@@ -337,6 +337,10 @@ class Projection:
         out: FloatArray = self.Q.dot(self.Q.T.dot(white))
         return out if self.held is None else out + self.held @ (self.held.T @ white)
 
+    def acceleration_by(self, f: FloatArray) -> FloatArray:
+        """M^-1 f (nv,) of the forces f (nv,)."""
+        return self.unwhiten(whiten(self.U, f))
+
     def tangential_force(self, f: FloatArray) -> FloatArray:
         """M (1 - P) M^-1 f (nv,): what the rows in use leave of the forces f (nv,)."""
         white = whiten(self.U, f)

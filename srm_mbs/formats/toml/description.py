@@ -305,6 +305,8 @@ LARGEST_KEY_DEPTH = 50
 LARGEST_VALUE_DEPTH = 50
 """Tables and lists in each other."""
 _KEY_PART = r"""(?>[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+TABLE_TWICE = re.compile(r"Cannot declare .* twice", re.DOTALL)
+"""Message of tomllib about a second [loop], which is meant as [[loop]]."""
 DEEP_KEY = re.compile(rf"(?<![A-Za-z0-9_-])(?>{_KEY_PART}[ \t]*+\.[ \t]*+){{{LARGEST_KEY_DEPTH}}}")
 """Keys with more parts than that, for which the time of tomllib grows as their square."""
 
@@ -334,11 +336,14 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
     try:
         entries = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # an endless integer, nesting without end
+        remedy = (
+            "Write double brackets above each table of a list, as [[loop]], and other tables once"
+            if TABLE_TWICE.match(str(error))
+            else "Correct it there; text stands in quotes, as keys with blanks or accents do, "
+            "lists in [ ]"
+        )
         raise InputError(
-            f"this is not valid TOML: {_without_quotes(error)}",
-            file=file,
-            remedy="Correct it there; text stands in quotes, as keys with blanks or accents do, "
-            "lists in [ ]",
+            f"this is not valid TOML: {_without_quotes(error)}", file=file, remedy=remedy
         ) from error
     with naming(file=file):
         _check_texts(entries)

@@ -272,7 +272,6 @@ class StagePlaces:
 
     def __init__(self, scheme: ButcherTableau, scatters: bool) -> None:
         self.gaps = Gaps(scheme)
-        self.explicit = scheme.implicit is None
         self.abscissae = scheme.abscissae
         self.inverse = inverse_abscissae(scheme, scatters)
         self.later_stages = np.flatnonzero(self.abscissae > 0.0).tolist()
@@ -373,8 +372,6 @@ class SingularityPlacement(ControlWrapper):
         """Whether stages next to a singular configuration are to be solved by nodes of the branch:
         the motion turns back, is slow or ends there."""
         history = memory.history
-        if not self._places.explicit:
-            return False
         if self._lost_branch or history is None or history.known_until >= proposal.t_new:
             return False
         if not self.adaptive:

@@ -39,6 +39,10 @@ LONGEST_FIRST = 100.0
 AT_REST = 1e-6
 """Time in which rates would change by themselves, over the length of the probe, below which they
 may be those of a rest that drives, or forces over time, end."""
+REST_PROBES = (0.41, 0.07)
+"""Parts of the first smooth interval at which the end of a rest shows that is over at its end."""
+REST_ENDS = 1e3
+"""Change of the rates there, over that at the end of the run, from which it is no rounding."""
 REST_FACTOR = 4.0
 """Ratio of the times at which the end of the rest is looked for."""
 CLOCK_ROUNDING = 1e-10
@@ -308,6 +312,7 @@ def initial_step(
     span: float,
     order: int,
     t: float = 0.0,
+    smooth: float = np.inf,
 ) -> float:
     """Length of the first step (s): the thesis' appendix B.2, independent of the unit of time.
 
@@ -316,7 +321,10 @@ def initial_step(
 
     At rest d1 is rounding, or next to it, and tau says nothing.  Where only the passing of time
     changes the rates there, tau is the time scale of that, and d1 the change of the rates over it.
+    A drive that moves smoothly from rest to rest shows at its end, or in its middle, no change: it
+    is looked for at two more times in the first ``smooth`` seconds, where the equations are smooth.
     """
+    smooth = min(smooth, span)
     weights = norm.weights(memory.state_scale)
     # |x| itself may vanish; at the size atol / rtol both tolerances allow the same error.
     d0 = norm(np.maximum(memory.state_scale, norm.one), weights)
@@ -327,7 +335,7 @@ def initial_step(
     if not np.isfinite(d1):
         raise EvaluationError(_TOO_TIGHT)
     if not d1 > 0.0:
-        return PROBE_LENGTH * span
+        return PROBE_LENGTH * smooth
     h0 = min(PROBE_LENGTH * d0 / d1, span)
 
     def change(ahead: float, moves: float = 1.0) -> float:
@@ -342,12 +350,34 @@ def initial_step(
     if not np.isfinite(d2):
         raise EvaluationError(_TOO_TIGHT)
     longest = LONGEST_FIRST * h0
+    if h0 == span:
+        for part in REST_PROBES:
+            ahead = part * smooth
+            changed = change(ahead, 0.0)
+            if changed > REST_ENDS * d2 * h0:
+                h0, d2 = ahead, changed / ahead
     if not d2 > 0.0:
         return min(longest, span)
     tau = d1 / d2
     if tau < AT_REST * h0 and change(h0, 0.0) > 0.5 * h0 * d2:
         tau, d1 = _end_of_rest(lambda ahead: change(ahead, 0.0), tau, h0)
     return float(min(longest, tau * (PROBE_LENGTH / (tau * d1)) ** (1.0 / order), span))
+
+
+def longest_from_rest(
+    system: System, memory: IntegratorState, norm: ErrorNorm, ahead: float
+) -> float:
+    """Longest step (s) from a breakpoint of a driven mechanism, in a smooth interval that goes on
+    for ``ahead`` (s): unbounded unless it rests.
+
+    A drive that leaves its rest smoothly may have, at the stages of a step over its whole motion,
+    the accelerations of the rest.
+    """
+    analysis = system.singularities
+    if analysis is None or not analysis.driven:
+        return math.inf
+    moved = ahead * norm(memory.rate, norm.weights(memory.state_scale))
+    return REST_PROBES[-1] * ahead if moved < norm.negligible else math.inf
 
 
 def _end_of_rest(

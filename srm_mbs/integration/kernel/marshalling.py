@@ -122,6 +122,8 @@ def constants() -> Any:
         layer_approached=reversals.APPROACHED,
         layer_unresolved=reversals.UNRESOLVED,
         difference=linear_split_step.DIFFERENCE,
+        central_difference=linear_split_step.CENTRAL_DIFFERENCE,
+        friction_difference=linear_split_step.FRICTION_DIFFERENCE,
         time_difference=linear_split_step.TIME_DIFFERENCE,
         shortest_difference=linear_split_step.SHORTEST_DIFFERENCE,
         # Step-size control.
@@ -137,6 +139,9 @@ def constants() -> Any:
         first_step_probe=step_size.PROBE_LENGTH,
         longest_first_step=step_size.LONGEST_FIRST,
         at_rest=step_size.AT_REST,
+        rest_probe_late=step_size.REST_PROBES[0],
+        rest_probe_early=step_size.REST_PROBES[1],
+        rest_ends=step_size.REST_ENDS,
         rest_factor=step_size.REST_FACTOR,
         clock_rounding=step_size.CLOCK_ROUNDING,
         # Placement.
@@ -169,7 +174,8 @@ def constants() -> Any:
         critical_iterations=critical.ITERATIONS,
         critical_difference=critical.DIFFERENCE,
         critical_converged=critical.CONVERGED,
-        critical_accepted=critical.DECIDED,
+        critical_decided=critical.DECIDED,
+        critical_accepted=critical.ACCEPTED,
         critical_frozen=critical.FROZEN,
         critical_ridge=critical.RIDGE,
         critical_reach=critical_passages.SEARCH,

@@ -81,8 +81,9 @@ class Linearisation:
         Derivatives of the laws by the chart coordinates.
     by_laws : (n, m)
         Derivatives of the chart rates by what acts in place of the laws.
-    on_branch
-        Whether they are those of the rates on the branch next to a singular configuration.
+    places
+        Whether they are those of the rates on the branch next to a singular configuration, and
+        whether nodes of it solve them.
     """
 
     rate: FloatArray
@@ -92,7 +93,7 @@ class Linearisation:
     laws: FloatArray
     by_coordinates: FloatArray
     by_laws: FloatArray
-    on_branch: bool
+    places: tuple[bool, bool]
 
 
 @dataclass

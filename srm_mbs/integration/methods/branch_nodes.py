@@ -76,10 +76,23 @@ _SLOPE = np.array([-0.8, 0.8, 0.2, -0.2, -4 / 105, 4 / 105, 1 / 280, -1 / 280])
 
 
 class BranchNodes(StageOnBranch):
-    """Solves stages of ``system`` by nodes of their branch: after :meth:`solve` it is the stage."""
+    """Solves stages of ``system`` by nodes of their branch: after :meth:`solve` it is the stage.
 
-    def __init__(self, system: BranchSystem) -> None:
-        self._system = system
+    Parameters
+    ----------
+    finds_laws
+        Whether the laws of forces are found as well.
+
+    Attributes
+    ----------
+    laws : (m,)
+        Laws of forces at the stage.  What closures leave of the forces F of joined ones,
+        F - M P M^-1 F, is smooth on the branch.
+    """
+
+    def __init__(self, system: BranchSystem, finds_laws: bool = False) -> None:
+        self._system, self._finds_laws = system, finds_laws
+        self.laws = np.zeros(0)
 
     def _sigma_at(self, t: float, state: FloatArray, move: FloatArray) -> float:
         moved = self._system.retract(state, np.concatenate([move, np.zeros_like(move)]))
@@ -191,9 +204,15 @@ class BranchNodes(StageOnBranch):
         self.away = (away + _SLOPE @ closings)[None]
         self.state = system.retract(state, -self.moved)
         free = system.evaluate(t, self.state).free_acceleration()
+        joined = None
+        if self._finds_laws:
+            joined = system.joined_laws()
+            self.laws = system.laws if joined is None else joined[0].copy()
         multipliers, size = [], 0.0
-        for node, *_ in found:
+        for weight, (node, *_) in zip(_VALUE.tolist(), found):
             terms = system.evaluate(t, node)
+            if joined is not None:
+                self.laws -= weight * terms.momentum(terms.project(joined[1]))
             multipliers.append(terms.multiplier_of(free))
             size = max(size, system.position_norm(terms.free_acceleration()))
         values = np.array(multipliers)
@@ -215,6 +234,8 @@ class StageNodes(BranchNodes):
         Start of the step (s) and the state there (nx,).
     direction : (1, nv), (f + 1, nv) or None
         That of :meth:`find_direction` there; None to find it when a stage needs it.
+    finds_laws
+        As for :class:`BranchNodes`.
 
     Attributes
     ----------
@@ -230,8 +251,9 @@ class StageNodes(BranchNodes):
         t: float,
         state: FloatArray,
         direction: FloatArray | None,
+        finds_laws: bool = False,
     ) -> None:
-        super().__init__(system)
+        super().__init__(system, finds_laws)
         self._start, self._direction = (t, state), direction
         self._touching: TouchingBranch | None = None
         self.used = self.lost = False
@@ -257,6 +279,8 @@ class StageNodes(BranchNodes):
         if self._direction is None:
             return False
         if len(self._direction) > 1:
+            if self._finds_laws:  # which nodes of branches that touch do not
+                return False
             return self._solve_touching(t, state, self._direction)
         return self.solve(t, state, self._direction[0])
 

@@ -30,11 +30,12 @@ may grow with c.
 (:mod:`srm_mbs.integration.methods.near_singular`): what is integrated there are the rates at the
 nearest place on the branch, and J is their derivative.  Along the branch it is as smooth as the
 motion, along the normals it is 0; that of the rates off the branch grows like 1/sigma^2.  So J is
-found by differences along the tangents (1 - P) e_j, at projected places.
+found by differences along the tangents (1 - P) e_j, at projected places.  Where the motion lingers
+and nodes of the branch solve the stages (:mod:`srm_mbs.integration.methods.branch_nodes`), they
+solve the places of the differences, too.  All differences are central there, and longer: nodes
+round to 1e-13 only, direct solves beside them to more.  Where branches touch nodes are not used.
 
-Everything else, the correction at the end, the zone and the placement, is that of explicit steps;
-only stages of motions that linger next to a singular configuration are not solved by nodes of the
-branch.
+Everything else, the correction at the end, the zone and the placement, is that of explicit steps.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System, Terms
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Linearisation, StepResult
+from srm_mbs.integration.methods.branch_nodes import BRANCH_SIGMA, StageNodes
 from srm_mbs.integration.methods.near_singular import BranchStages
 from srm_mbs.integration.methods.split_step import SplitStep, Stages
 from srm_mbs.integration.methods.stiffness import largest_eigenvalue
@@ -54,6 +56,10 @@ from srm_mbs.model.lazy import cached_property
 
 DIFFERENCE = 2.0**-26
 """Step of a difference by a coordinate, over its size: the root of the rounding."""
+CENTRAL_DIFFERENCE = 2.0**-17
+"""The same of a central one, where a motion lingers."""
+FRICTION_DIFFERENCE = 2.0**-10
+"""Step of that by a rate, at most, over the speed in which friction changes its sign."""
 TIME_DIFFERENCE = 2.0**-17
 """Step of a difference by time, over that of the integration: the third root of the rounding,
 because that difference is of second order."""
@@ -74,33 +80,42 @@ def linearised(
     memory: IntegratorState,
     norm: ErrorNorm,
     branch: BranchStages | None,
+    nodes: StageNodes | None = None,
 ) -> Linearisation:
     """``system`` linearised at ``state`` (nx,) and ``t`` (s), for steps of about ``h`` (s), whose
-    stages are those of ``branch``."""
+    stages are those of ``branch`` and ``nodes``."""
     n, k = system.tangent_size, system.multiplier_part.start
     unit = norm.one if norm.unit is None else norm.unit
     zone, on_branch = (None, False) if branch is None else (branch.zone, branch.near)
 
-    def terms_at(time: float, x: FloatArray) -> Terms:
-        terms = system.evaluate(time, x, zone)
+    def solved_at(time: float, x: FloatArray) -> Terms | StageNodes:
+        terms = system.evaluate(time, x, zone if nodes is None else None)
+        if nodes is not None and terms.sigma < BRANCH_SIGMA:
+            if nodes.solve_stage(time, x):
+                return nodes
+            terms = system.evaluate(time, x, zone)
         if on_branch and not terms.rank_deficient:
             terms = system.evaluate(time, system.retract(x, -terms.correction()), zone)
         return terms
 
+    def rate_of(stage: Terms | StageNodes) -> tuple[FloatArray, FloatArray]:
+        if isinstance(stage, StageNodes):
+            return stage.rate.copy(), stage.laws.copy()
+        return stage.rate().copy(), system.laws
+
     def rate_at(time: float, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        rate = terms_at(time, x).rate().copy()
-        return rate, system.laws
+        return rate_of(solved_at(time, x))
 
     # The rate of the memory is the one before the last correction, which stiff forces notice.
     system.apply_laws(memory.laws)
-    terms = terms_at(t, state)
-    rate, laws, directions = terms.rate().copy(), system.laws, np.eye(n)
-    along = on_branch and not terms.rank_deficient
-    if along:
+    start = solved_at(t, state)
+    (rate, laws), directions = rate_of(start), np.eye(n)
+    along = isinstance(start, StageNodes) or (on_branch and not start.rank_deficient)
+    if along and not isinstance(start, StageNodes):
         size = n - k  # of positions and of rates, or of all unknowns
-        tangents = np.transpose([e - terms.project(e) for e in np.eye(size)])
-        for start in range(0, n, size):
-            directions[start : start + size, start : start + size] = tangents
+        tangents = np.transpose([e - start.project(e) for e in np.eye(size)])
+        for i in range(0, n, size):
+            directions[i : i + size, i : i + size] = tangents
     applied = laws if memory.laws is None else memory.laws
     m = len(applied)
     system.apply_laws(applied if m else None)
@@ -121,8 +136,22 @@ def linearised(
         there = np.concatenate([x[len(x) - k :], rate[k:]])
         return there, known.by_forces @ ((forces - held) / step), system.laws
 
+    central = along and nodes is not None
+    if central:
+        sizes = CENTRAL_DIFFERENCE * np.maximum(unit, memory.state_scale)
+        if len(system.friction_sums):
+            sizes[k:] = np.minimum(sizes[k:], FRICTION_DIFFERENCE * system.friction_speed)
+        steps = np.maximum(steps, rounded_down(sizes))
     for j, step in enumerate(steps.tolist()):
         delta = step * directions[:, j]
+        if central:
+            (ahead, own), (behind, other) = (
+                rate_at(t, system.retract(state, side * delta)) for side in (1.0, -1.0)
+            )
+            there = system.chart_rate(delta, ahead) - system.chart_rate(-delta, behind)
+            J[:, j] = np.concatenate([there[:k], (ahead - behind)[k:]]) / (2.0 * step)
+            by_coordinates[:, j] = (own - other) / (2.0 * step)
+            continue
         there, J[k:, j], own = probe(step, system.retract(state, delta))
         J[:k, j] = (system.chart_rate(delta, there) - rate)[:k] / step
         by_coordinates[:, j] = (own - laws) / step
@@ -139,7 +168,9 @@ def linearised(
         tau = float(rounded_down(np.array(max(TIME_DIFFERENCE * h, shortest))))
         first, second = (rate_at(t + i * tau, state)[0] - rate for i in (1.0, 2.0))
         by_time = (4.0 * first - second) / (2.0 * tau)
-    return Linearisation(rate, J, by_time, applied, laws, by_coordinates, by_laws, on_branch)
+    return Linearisation(
+        rate, J, by_time, applied, laws, by_coordinates, by_laws, (on_branch, nodes is not None)
+    )
 
 
 class LinearStages:
@@ -148,19 +179,18 @@ class LinearStages:
     Parameters
     ----------
     rate_of
-        (stage, its chart rate (n,), the laws there (m,)) -> its rate (n,) in the scheme.
+        See :meth:`Stages.rate`.
     apply
         Lets the laws of a stage act, which it returns (m,).
     """
 
     def __init__(
         self,
-        system: System,
         rate_of: Callable[[int, FloatArray, FloatArray], FloatArray],
         apply: Callable[[int], FloatArray],
         stiffness: float,
     ) -> None:
-        self._system, self._rate_of, self._apply = system, rate_of, apply
+        self.rate, self._apply = rate_of, apply
         self.stiffness = stiffness
         self.laws: FloatArray | None = None
 
@@ -168,19 +198,10 @@ class LinearStages:
         """See :class:`Stages`."""
         self.laws = self._apply(j)
 
-    def rate(self, j: int, rate: FloatArray) -> FloatArray:
-        """See :class:`Stages`."""
-        return self._rate_of(j, rate, self._system.laws)
-
 
 @dataclass(frozen=True)
 class LinearSplitStep(SplitStep):
     """Steps of a linearly implicit ``scheme``; see :class:`SplitStep`."""
-
-    @property
-    def uses_nodes(self) -> bool:
-        """No: see the module."""
-        return False
 
     def step(
         self,
@@ -213,6 +234,7 @@ class LinearSplitStep(SplitStep):
         memory: IntegratorState,
         norm: ErrorNorm,
         branch: BranchStages | None,
+        nodes: StageNodes | None,
         rates: FloatArray,
     ) -> Stages:
         """See :class:`SplitStep`; the equations are linearised here."""
@@ -221,8 +243,9 @@ class LinearSplitStep(SplitStep):
         scheme, n, implicit = self.scheme, system.tangent_size, self._implicit
         lead, end = scheme.lead, scheme.n_stages
         known = memory.linearisation
-        if known is None or known.on_branch != (branch is not None and branch.near):
-            known = linearised(system, t, h, state, memory, norm, branch)
+        places = (branch is not None and branch.near, nodes is not None)
+        if known is None or known.places != places:
+            known = linearised(system, t, h, state, memory, norm, branch, nodes)
             memory.linearisation = known
         gamma = float(implicit[lead, lead])
         factors = lu_factor(np.eye(n) - h * gamma * known.J, check_finite=False)
@@ -250,7 +273,7 @@ class LinearSplitStep(SplitStep):
         unit = norm.one if norm.unit is None else norm.unit
         k = system.multiplier_part.start
         stiffness = largest_eigenvalue(known.J, h, unit, k)
-        return LinearStages(system, rate_of, apply, stiffness)
+        return LinearStages(rate_of, apply, stiffness)
 
 
 @dataclass(frozen=True)

@@ -66,8 +66,9 @@ class Stages(Protocol):
     def begin(self, j: int) -> None:
         """Prepare the system for the stage ``j``."""
 
-    def rate(self, j: int, rate: FloatArray) -> FloatArray:
-        """The rate (n,) of the stage ``j`` in the scheme, from the chart rate."""
+    def rate(self, j: int, rate: FloatArray, laws: FloatArray) -> FloatArray:
+        """The rate (n,) of the stage ``j`` in the scheme, from the chart rate and the laws (m,) of
+        forces there."""
 
 
 @lru_cache(maxsize=64)
@@ -106,6 +107,7 @@ class SplitStep:
         memory: IntegratorState,
         norm: ErrorNorm,
         branch: BranchStages | None,
+        nodes: StageNodes | None,
         rates: FloatArray,
     ) -> Stages | None:
         """The stages of one step, None where the rates of the scheme are the chart rates; ``rates``
@@ -146,7 +148,8 @@ class SplitStep:
             weights = norm.weights(memory.state_scale)
             branch_system = system.branch_system
             if memory.lingering and self.uses_nodes and branch_system is not None:
-                nodes = StageNodes(branch_system, t, state, history.away)
+                implicit = scheme.implicit is not None
+                nodes = StageNodes(branch_system, t, state, history.away, implicit)
             lingers = nodes is not None
             branch = BranchStages(
                 system, memory, norm, weights, h, sigma_change, history, t + h, lingering=lingers
@@ -157,7 +160,7 @@ class SplitStep:
         rates = np.zeros((s + 1, system.tangent_size))
         weighed = rates[:s]
         first = scheme.lead + 1
-        stages = self.stage_rates(system, t, h, state, memory, norm, branch, rates)
+        stages = self.stage_rates(system, t, h, state, memory, norm, branch, nodes, rates)
         all_sigmas = [start] * first
         deficient: list[tuple[int, int, bool]] = []
         delta = np.zeros(system.tangent_size)
@@ -174,7 +177,9 @@ class SplitStep:
                 on_branch = sigma < BRANCH_SIGMA and nodes.solve_stage(time, x)
                 if on_branch:
                     x, rate = nodes.state, nodes.rate
-                    rates[j] = system.chart_rate(delta, rate)
+                    rates[j] = chart_rate = system.chart_rate(delta, rate)
+                    if stages is not None and j < s:
+                        rates[j] = stages.rate(j, chart_rate, nodes.laws)
                     continue
                 if sigma < BRANCH_SIGMA:
                     terms = system.evaluate(time, x, zone)
@@ -183,7 +188,7 @@ class SplitStep:
             rate = terms.rate()
             rates[j] = chart_rate = system.chart_rate(delta, rate)
             if stages is not None and j < s:
-                rates[j] = stages.rate(j, chart_rate)
+                rates[j] = stages.rate(j, chart_rate, system.laws)
             if terms.rank_deficient:
                 deficient.append((j, terms.rank, terms.held))
         change = abs(sigma - start)

@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, time_text
 from srm_mbs.formats.files import checked_path
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.numbers import finite_array
@@ -276,7 +276,7 @@ class JointMotion(AnimationMixin):
     def __repr__(self) -> str:
         first, last = self.span
         return (
-            f"JointMotion({self.mechanism.name!r}, t={first:.6g}..{last:.6g} s, "
+            f"JointMotion({self.mechanism.name!r}, t={time_text(first)}..{time_text(last)} s, "
             f"{len(self.t)} configurations)"
         )
 

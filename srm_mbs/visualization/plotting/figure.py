@@ -27,7 +27,7 @@ from matplotlib.ticker import (
 from numpy.typing import NDArray
 
 from srm_mbs.dynamics.scaling import is_angle
-from srm_mbs.errors import InputError, get_logger, known_names, safe_repr
+from srm_mbs.errors import InputError, get_logger, known_names, safe_repr, time_text
 from srm_mbs.formats.files import writing
 from srm_mbs.model.anchors import one_degree_joint
 from srm_mbs.simulation.result import SimulationResult
@@ -462,7 +462,7 @@ def run_title(solution: Run) -> str:
     if solution.success:
         return name
     unit = " s" if seconds(solution) else ""
-    return f"{name}\n{solution.status} at t = {solution.span[1]:.6g}{unit}"
+    return f"{name}\n{solution.status} at t = {time_text(solution.span[1])}{unit}"
 
 
 def settings_of(solution: Run) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from srm_mbs.dynamics.scaling import row_dimensions
+from srm_mbs.errors import time_text
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.visualization.plotting.figure import (
     BLACK,
@@ -83,7 +84,7 @@ def _energy(axes: Axes, solution: SimulationResult) -> str:
     factor = linear_axis(axes, [change], "energy change\n", "J", size=0.0)
     draw_line(axes, solution.t, change / factor, color=BLACK, **curve(len(change)))
     from_start = not len(solution.t) or solution.t[0] == solution.steps.times[0]
-    reference = "the start" if from_start else f"t = {solution.t[0]:.6g} s"
+    reference = "the start" if from_start else f"t = {time_text(solution.t[0])} s"
     return f"total energy relative to {reference}"
 
 

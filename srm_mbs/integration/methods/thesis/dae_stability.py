@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from srm_mbs.dynamics.dae import DaeSystem
-from srm_mbs.errors import EvaluationError
+from srm_mbs.errors import EvaluationError, time_text
 from srm_mbs.integration.driver import RunRecord
 from srm_mbs.integration.messages import RunFailure, StopReason
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -69,8 +69,8 @@ def instability(
         if lowest < -EIGENVALUE_ROUNDING * largest:
             return RunFailure(
                 StopReason.UNSTABLE_SWEEPS,
-                f"At t = {t:.6g} G B has an eigenvalue of {lowest:.3g} (real part), and T = I "
-                'drives sweeps away from the constraints along it: use T = "transpose" or '
+                f"At t = {time_text(t)} G B has an eigenvalue of {lowest:.3g} (real part), and T "
+                '= I drives sweeps away from the constraints along it: use T = "transpose" or '
                 '"inverse".',
             )
         growth = max(abs(stability_function(scheme, -h * mu / size)) for mu in damped.tolist())
@@ -78,7 +78,7 @@ def instability(
             worst, radius = growth, h * largest / size
             failure = RunFailure(
                 StopReason.UNSTABLE_SWEEPS,
-                f"The sweeps are unstable: at t = {t:.6g} h |G B T|/eps = {radius:.3g} "
+                f"The sweeps are unstable: at t = {time_text(t)} h |G B T|/eps = {radius:.3g} "
                 f"(spectral radius), and {scheme.name} is stable up to "
                 f'{real_stability_limit(scheme):.3g}: use T = "inverse", or a larger eps.',
             )

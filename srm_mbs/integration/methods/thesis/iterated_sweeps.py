@@ -45,7 +45,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System, Terms
-from srm_mbs.errors import EvaluationError
+from srm_mbs.errors import EvaluationError, time_text
 from srm_mbs.integration.methods.base import ErrorNorm, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau, DenseExtension
 from srm_mbs.integration.methods.multiplier_history import MultiplierHistory
@@ -468,22 +468,22 @@ class IteratedSweeps:
         if restarted:
             text += (
                 f" The sweeps gave up their own histories in {len(restarted)} steps, first at "
-                f"t = {restarted[0]:.6g} s: sigma was falling, they were too far off the "
+                f"t = {time_text(restarted[0])} s: sigma was falling, they were too far off the "
                 "constraints to tell the branch if a singular configuration came, and started "
                 "again from the accepted state."
             )
         if taken_over:
             text += (
                 f" {len(taken_over)} steps next to singular configurations, the first at "
-                f"t = {taken_over[0]:.6g} s, are of the split PSRM: rounding would have exceeded "
-                "the tolerance in sweeps."
+                f"t = {time_text(taken_over[0])} s, are of the split PSRM: rounding would have "
+                "exceeded the tolerance in sweeps."
             )
         worst = max(made, key=lambda step: step.drift_ratio, default=None)
         if norm.negligible > 0.0 and worst is not None and worst.drift_ratio > REPORTED_DRIFT:
             text += (
                 f" The last sweep was off the constraints by up to {worst.drift_ratio:.2g} times "
-                f"the tolerance (at t = {worst.t + worst.h:.6g} s), which no step-size control "
-                "mends: sweeps are accurate to a power of eps. Use restarted sweeps "
+                f"the tolerance (at t = {time_text(worst.t + worst.h)} s), which no step-size "
+                "control mends: sweeps are accurate to a power of eps. Use restarted sweeps "
                 "(restart=True, carry=True), a smaller eps, or PSRM."
             )
         return text

@@ -32,6 +32,8 @@ UNRESOLVED = 2.0
 friction."""
 REVERSAL_SHARE = 0.1
 """Error of a quadrature with some ten nodes across a jump, over the step times the jump."""
+SHORTEST = 1e-300
+"""Step (s) that is taken for shorter ones, whose inverse overflows: runs may be one rounding long."""
 POWER_ITERATIONS = 6
 """Products with the linearised equations that estimate their largest eigenvalue."""
 
@@ -134,6 +136,7 @@ def largest_eigenvalue(J: FloatArray, h: float, unit: FloatArray, k: int) -> flo
     k
         Number of positions among them: rates are measured in units of positions over ``h``.
     """
+    h = max(h, SHORTEST)
     scale = np.concatenate([unit[:k], unit[:k] / h]) if k else unit
     x = scale * np.where(np.arange(len(unit)) % 2, -1.0, 1.0)
     last = 1.0

@@ -33,7 +33,7 @@ friction."""
 REVERSAL_SHARE = 0.1
 """Error of a quadrature with some ten nodes across a jump, over the step times the jump."""
 SHORTEST = 1e-300
-"""Step (s) that is taken for shorter ones, whose inverse overflows: runs may be one rounding long."""
+"""Step (s) that is taken for shorter ones, whose inverse overflows: a run may last one rounding."""
 POWER_ITERATIONS = 6
 """Products with the linearised equations that estimate their largest eigenvalue."""
 

@@ -215,6 +215,7 @@ FINER = tuple(10.0**-k for k in range(9))
 size than its unit, and g vary faster than the run is long."""
 SETTLED = 0.1
 """They have where their change is that much smaller than their distance from what is given."""
+JACOBIAN_REMEDY = "Return the derivative of g with respect to x from G"
 WRONG_DERIVATIVE = 1e-3
 """Relative difference from which a derivative is called wrong."""
 
@@ -321,7 +322,9 @@ class DaeSystem:
         self.multiplier_size = self.nx if self.carries_yhat else self.ny
         self._check_values(t0, x0)
         self.projection = self._measured(t0, x0)
-        self._check_jacobian(t0, x0)
+        wrong = self.wrong_jacobian(t0, x0)
+        if wrong is not None:  # everything else would look right and be wrong
+            raise InputError(f"at the start, {wrong}", element="G", remedy=JACOBIAN_REMEDY)
         self.predicts = self._time_derivative_known(t0, x0, t_end)
 
     @property
@@ -436,8 +439,14 @@ class DaeSystem:
             )
         return ObliqueProjection(rows, columns, np.median(sizes_seen, axis=0).tolist())
 
-    def _check_jacobian(self, t: float, x: FloatArray) -> None:
-        """Refuse a G that is not dg/dx: everything else would look right and be wrong."""
+    def wrong_jacobian(self, t: float, x: FloatArray) -> str | None:
+        """That G at ``t`` and x (nx,) is not dg/dx; None if it is.
+
+        Raises
+        ------
+        CallbackError, EvaluationError
+            If G cannot be evaluated.
+        """
         G = self.call("G", t, x)
         for i in range(self.nx):
 
@@ -450,12 +459,11 @@ class DaeSystem:
             slope = _other_slope(slope_over, G[:, i], self.projection.rows)
             if slope is not None:
                 row = int(np.argmax(_differs(G[:, i], slope, self.projection.rows)))
-                raise InputError(
-                    f"G[{row}, {i}] = {G[row, i]:.6g} at the start, but dg/dx there is "
-                    f"{slope[row]:.6g} by finite differences",
-                    element="G",
-                    remedy="Return the derivative of g with respect to x from G",
+                return (
+                    f"G[{row}, {i}] is {G[row, i]:.6g}, but dg/dx is {slope[row]:.6g} by finite "
+                    "differences"
                 )
+        return None
 
     def _time_derivative_known(self, t0: float, x: FloatArray, t_end: float) -> bool:
         """Whether g_t is given, or g does not depend on t."""

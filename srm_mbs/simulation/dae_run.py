@@ -8,8 +8,15 @@ from typing import Any, TypeVar
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.dae import DaeSystem
-from srm_mbs.errors import ControllerError, EvaluationError, InputError, safe_repr, time_text
+from srm_mbs.dynamics.dae import JACOBIAN_REMEDY, DaeSystem
+from srm_mbs.errors import (
+    CallbackError,
+    ControllerError,
+    EvaluationError,
+    InputError,
+    safe_repr,
+    time_text,
+)
 from srm_mbs.integration.control.prescribed_times import suspected
 from srm_mbs.integration.control.step_size import ControlWrapper
 from srm_mbs.integration.driver import RunRecord, RunStatus
@@ -154,6 +161,7 @@ def run_dae(
     raise_at_first_call(record.error, t0)
     if record.status is RunStatus.INTERRUPTED:
         record.add_pace(options.t_end, PACE_REMEDY)
+    _check_jacobian(system, record)
     turned = suspected(wrappers)
     if first_sweeps:
         _add_sweep_failure(system, options, record, first_sweeps, turned)
@@ -211,6 +219,23 @@ def _integrate(
     except (EvaluationError, ControllerError) as error:
         record = failed_start(options.t0, state, error)
     return record, wrappers, first_sweeps
+
+
+def _check_jacobian(system: DaeSystem, record: RunRecord) -> None:
+    """Mark and explain in the record that G is not dg/dx where the run ended: at the start, where
+    it is checked too, a wrong one may have the values of the right one."""
+    if not record.times:
+        return
+    t = record.times[-1]
+    try:
+        wrong = system.wrong_jacobian(t, record.last_state)
+    except (CallbackError, EvaluationError):
+        return
+    if wrong is not None:
+        record.status = RunStatus.FAILED
+        record.message = (
+            f"The results are wrong: at t = {time_text(t)} s, {wrong}. {JACOBIAN_REMEDY}."
+        )
 
 
 def _add_sweep_failure(

@@ -584,6 +584,23 @@ def test_states_far_below_the_absolute_tolerance_are_refused_with_the_remedy() -
         srm.solve_dae(problem, (0.0, 1.0), START_PASSING * 1e-9)
 
 
+def test_a_jacobian_that_is_right_at_the_start_alone_fails_the_run() -> None:
+    """A point on a circle: G has 2 x_1 for x_1, which is 0 at the start."""
+    problem = srm.SemiExplicitDAE(
+        f=lambda t, x: np.array([-x[1], x[0]]),
+        B=lambda t, x: x[:, None],
+        g=lambda t, x: np.array([0.5 * (x @ x - 1.0)]),
+        G=lambda t, x: np.array([[x[0], 2.0 * x[1]]]),
+    )
+    run = srm.solve_dae(problem, (0.0, 0.5), [1.0, 0.0])
+    assert run.status == "failed"
+    assert "G[0, 1] is" in run.message
+    assert "Return the derivative of g" in run.message
+    assert len(run.t) > 2
+    right = replace(problem, G=lambda t, x: x[None])
+    assert srm.solve_dae(right, (0.0, 0.5), [1.0, 0.0]).success
+
+
 @pytest.mark.parametrize("t_end", [10.0, 1e4, 1e5])
 def test_a_fast_constraint_of_a_long_run_has_its_derivative(t_end: float) -> None:
     """x_0 = sin(30 t); the event ends the run, whose length decides how g_t is examined."""

@@ -39,6 +39,7 @@ from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.observables import CompiledObservables
 from srm_mbs.integration.methods.butcher import ButcherTableau
+from srm_mbs.integration.methods.psrm import is_split
 from srm_mbs.integration.run_samples import RunSamples, run_samples
 from srm_mbs.integration.singular_passages import (
     Bifurcation,
@@ -299,7 +300,7 @@ class SimulationResult(RunOutcome):
         self._system = system
         self.t_eval = t_eval
         if t_eval is not None:
-            _ = self._nodes  # what cannot be evaluated is an error here
+            _ = self._computed_nodes  # what cannot be evaluated is an error here
         self._events = events
 
     @cached_property
@@ -325,11 +326,12 @@ class SimulationResult(RunOutcome):
 
     @cached_property
     def _nodes(self) -> tuple[FloatArray, FloatArray]:
-        """Times (n,) s, and states (n, nx) there; that at the end of the run is on the closures."""
+        """Times (n,) s, and states (n, nx) there; that at the end of the run is on the closures, as
+        the other ends of steps are but for sweeps."""
         t, states = self._computed_nodes
         mechanism = self.mechanism
         ended = self.status is not RunStatus.FAILED and len(t) and t[-1] == self.span[1]
-        if not (ended and mechanism.constrained):
+        if not (ended and mechanism.constrained and self.is_split):
             return t, states
         end = states[-1]
         last = closed_end(mechanism, float(t[-1]), end, self.backend, self._system)
@@ -338,6 +340,13 @@ class SimulationResult(RunOutcome):
             states[-1] = last
             states.setflags(write=False)
         return t, states
+
+    @property
+    def is_split(self) -> bool:
+        """Whether the split PSRM made the run; False where that is not known."""
+        request = self.request
+        method = None if request is None else request.method
+        return method == "psrm" if method is None or isinstance(method, str) else is_split(method)
 
     @cached_property
     def _computed_nodes(self) -> tuple[FloatArray, FloatArray]:

@@ -19,7 +19,6 @@ from srm_mbs.analysis.accuracy.samples import sample_times
 from srm_mbs.dynamics.observables import NO_ANGLES
 from srm_mbs.dynamics.scaling import angle_coordinates, start_rounding
 from srm_mbs.errors import InputError
-from srm_mbs.integration.methods.psrm import is_split
 from srm_mbs.integration.run_samples import RunSamples
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_model
@@ -365,10 +364,7 @@ def observed_order(settings: Sequence[float], differences: Sequence[float]) -> f
 def _expected(solution: SimulationResult, fixed: bool) -> float | None:
     if not fixed:
         return 1.0
-    request = solution.request
-    method = "" if request is None else request.method
-    split = method == "psrm" if isinstance(method, str) else is_split(method)
-    return float(solution.scheme.order) if split else None
+    return float(solution.scheme.order) if solution.is_split else None
 
 
 def parted_at(whole: Comparison, run: SimulationResult, other: SimulationResult) -> float | None:

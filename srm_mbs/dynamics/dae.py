@@ -256,7 +256,7 @@ def _units(x0: FloatArray, one: FloatArray) -> FloatArray:
     """Sizes (nx,) of the states: |x0|, or what the tolerance is absolute to, ``one``, between 1 and
     the largest state; 1 at the origin, where the states tell nothing.
 
-    Within them nothing distinguishes a small circle from a point next to a singular one.
+    A circle of a radius far below them counts as a point next to a singular one.
     """
     largest = float(np.abs(x0).max()) or 1.0
     least = np.clip(one, min(1.0, largest), max(1.0, largest))
@@ -440,7 +440,7 @@ class DaeSystem:
         return ObliqueProjection(rows, columns, np.median(sizes_seen, axis=0).tolist())
 
     def wrong_jacobian(self, t: float, x: FloatArray) -> str | None:
-        """That G at ``t`` and x (nx,) is not dg/dx; None if it is.
+        """Says where G at ``t`` and x (nx,) is not dg/dx; None if it is.
 
         Raises
         ------

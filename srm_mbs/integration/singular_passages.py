@@ -97,8 +97,9 @@ STRAIGHT_AT = np.array([0.5, 1.0])
 sample."""
 NEXT_TO_SAMPLE = 0.2
 """Distance of a crossing from a sample, over the interval, below which that shows no slope."""
-LEAST_SLOPE = 0.5
-"""Growth of sigma over time, over that next to a crossing, below which the motion may turn back."""
+LEAST_SLOPE = 0.7
+"""sigma over the time from a crossing, over that next to it, below which the motion may turn
+back."""
 SAMPLES_AROUND = 100
 """Samples on either side of a crossing at which that is looked for."""
 EVERY = 4
@@ -1003,7 +1004,7 @@ def find_crossings(
                 recorded.samples.tolist(), recorded.tops.tolist(), recorded.free(len(t)).tolist()
             )
         ]
-        searches += [_crossings_at_turn(monitor, steps, t, turn) for turn in recorded.turns or ()]
+        searches += [_crossings_beside(monitor, steps, t, turn) for turn in recorded.turns or ()]
     found: dict[float, Crossing] = {}
     for crossings in (*monitor.together(searches), _crossings_along_curves(monitor, steps)):
         for crossing in crossings:
@@ -1063,32 +1064,23 @@ def _crossings_at(
     )
 
 
-def _crossings_at_turn(
+def _crossings_beside(
     monitor: ConstraintMonitor, steps: StepData, t: FloatArray, turn: Turn
 ) -> Search[list[Crossing]]:
     """The two crossings next to a ``turn`` beyond a singular configuration; t (k,) s of the
     recorded samples."""
+    (before, rest, after), (_, value, _) = turn.times, turn.values
     scale = float((yield t[[turn.top]])[0])
-    return (yield from _crossings_beside(monitor, steps, turn.times, turn.values, scale))
-
-
-def _crossings_beside(
-    monitor: ConstraintMonitor,
-    steps: StepData,
-    times: Sequence[float],
-    values: Sequence[float],
-    scale: float,
-) -> Search[list[Crossing]]:
-    """The two crossings beside a turn with the ``times`` and ``values`` of a :class:`Turn`."""
-    (before, rest, after), (_, value, _) = times, values
-    found: list[Crossing] = []
-    for side, size in ((before, values[0]), (after, values[2])):
+    found = []
+    for side, size in ((before, turn.values[0]), (after, turn.values[2])):
         # Next to the turn values are parabolic in time.
         part = math.sqrt(value / (value - size)) * BESIDE_TURN
-        own = np.sort(np.append(rest + (side - rest) * np.append(0.0, part[part < 1.0]), side))
-        there = yield own
-        minimum = 0, 1 + int(there[1:-1].argmin()), len(own) - 1
-        crossing = yield from _crossing_at(monitor, steps, minimum, scale, own, there)
+        times = np.sort(np.append(rest + (side - rest) * np.append(0.0, part[part < 1.0]), side))
+        values = yield times
+        k = 1 + int(values[1:-1].argmin())
+        crossing = yield from _crossing_at(
+            monitor, steps, (0, k, len(times) - 1), scale, times, values
+        )
         if crossing is not None:
             found.append(crossing)
     return found
@@ -1185,37 +1177,33 @@ def _nearest_samples(time: float, t: FloatArray) -> tuple[int, int]:
 def _may_turn(time: float, t: FloatArray, sigma: FloatArray) -> Search[bool]:
     """Whether the motion may turn back next to a crossing at ``time`` (s).
 
-    Where it does not, the singular value is proportional to the time from the crossing up to the
-    samples next to it, and ``sigma`` (k,) at t (k,) goes on growing as fast beyond them.
+    Where it does not, the singular value is in proportion to the time from the crossing up to the
+    samples next to it, and ``sigma`` (k,) at t (k,) is about so beyond them.
     """
     nearest = _nearest_samples(time, t)
     if not t[nearest[0]] < time < t[nearest[1]]:
         return False  # at an end of the run
-    slopes = [float(sigma[i]) / abs(float(t[i]) - time) for i in nearest]
-    least = LEAST_SLOPE * max(slopes)
-    if min(slopes) < least:
-        return True
-    for i, way in zip(nearest, (-1, 1)):
-        for _ in range(SAMPLES_AROUND):
-            following = i + way
-            if not 0 <= following < len(t) or sigma[i] > FAR_SIGMA:
-                break
-            if sigma[following] - sigma[i] < least * abs(t[following] - t[i]):
+    before, after = nearest
+    least = LEAST_SLOPE * max(float(sigma[i]) / abs(float(t[i]) - time) for i in nearest)
+    for outward in (
+        range(before, max(before - SAMPLES_AROUND, -1), -1),
+        range(after, min(after + SAMPLES_AROUND, len(t))),
+    ):
+        for i in outward:
+            if sigma[i] < least * abs(float(t[i]) - time):
                 return True
-            i = following
+            if sigma[i] > FAR_SIGMA:
+                break
     values = yield np.concatenate([time + (t[i] - time) * STRAIGHT_AT for i in nearest])
-    half_before, before, half_after, after = values.tolist()
-    return not (
-        before < 2.0 * SLOPE_MARGIN * half_before < 2.0 * SLOPE_MARGIN**2 * before
-        and after < 2.0 * SLOPE_MARGIN * half_after < 2.0 * SLOPE_MARGIN**2 * after
-    )
+    parts = values.reshape(2, -1) / STRAIGHT_AT
+    return not bool((parts.max(axis=1) < SLOPE_MARGIN * parts.min(axis=1)).all())
 
 
 def _sign_changes(
     monitor: ConstraintMonitor, time: float, scale: float, t: FloatArray
 ) -> Search[list[float]]:
-    """About when (s), next to a crossing at ``time``, the part of G that loses rank there is zero;
-    t (k,): the recorded samples."""
+    """About when (s), next to a crossing at ``time``, the part of G that loses rank there is zero
+    again; t (k,): the recorded samples."""
     from scipy.optimize import brentq
 
     before, after = _nearest_samples(time, t)
@@ -1250,7 +1238,7 @@ def _sign_changes(
     return [
         float(brentq(part, times[k], times[k + 1], xtol=ROOT_TOLERANCE * (times[k + 1] - times[k])))
         for k, is_real in zip(changes, real)
-        if is_real
+        if is_real and not times[k] <= time <= times[k + 1]
     ]
 
 

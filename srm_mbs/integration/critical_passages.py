@@ -98,6 +98,9 @@ CUT, CUT_FROM = 1.1, 0.9
 """Length of a panel in which the passage is to stop, over the one that is predicted to lead there,
 and the length, over that of the whole panel, below which it is cut so.  Interpolation to a time in
 it is then almost as accurate as its quadrature."""
+START_REACH = 0.1
+"""Distance (units) from a critical configuration up to which a motion that starts in its layer is
+followed along the curve."""
 SMALLEST_REST = 1e-9
 """Rest of a passage, over its whole, that is none."""
 
@@ -655,6 +658,44 @@ def examined_passages(
     return CriticalPassages(branch_system, method.scheme, norm, tolerance)
 
 
+def step_from_layer(v: FloatArray, unit: FloatArray) -> float:
+    """The first step (s) after a motion that starts in a layer with the rates ``v`` (nv,): about
+    the time in which it leaves that.  ``unit`` (nv,): of the coordinates."""
+    return START_REACH / float(np.abs(v / unit).max())
+
+
+def layer_motion(
+    system: BranchSystem, t: float, state: FloatArray, tolerance: float, reach: float
+) -> PlaceOnCurve | None:
+    """The motion from ``state`` (nx,) at ``t`` (s) in the layer of a critical configuration with a
+    residual above ``tolerance`` (row units), to be followed along the curve up to the distance
+    ``reach`` (units) from that; None if there is none.
+
+    The energy is that of the rates as they are: rounding turns them by more than it changes their
+    size.
+    """
+    analysis = system.singularities
+    q, v = analysis.split(state)
+    geometry = analysis.geometry(analysis.q0, t)
+    place, rates = geometry.at(q, t), geometry.rates(v)
+    try:
+        critical = critical_configuration(
+            geometry, analysis.rank, place, SEARCH, (), ROUNDED_RESIDUAL
+        )
+        if critical is None or not abs(critical.residual) > max(tolerance, ROUNDED_RESIDUAL):
+            return None
+        curve = CurveThroughSaddle(critical, place, False)
+        geometry.closure(place)
+    except (ValueError, EvaluationError, np.linalg.LinAlgError):
+        return None
+    along, own = float(curve.along @ rates), rates[: len(v)]
+    if along == 0.0 or not max(abs(curve.beta), curve.width) < reach:
+        return None
+    energy = 0.5 * float(own @ geometry.mass() @ own)
+    begin = -float(np.sign(along)) * reach
+    return PlaceOnCurve(critical, False, curve, begin, curve.beta, energy)
+
+
 class CriticalPassages:
     """Examines the singular configurations that steps would pass; used by the drivers.
 
@@ -692,6 +733,13 @@ class CriticalPassages:
     def under_way(self) -> bool:
         """Whether a passage stopped on its way; :meth:`steps_on` goes on with it."""
         return self._rest is not None
+
+    def begin(self, t: float, state: FloatArray) -> bool:
+        """Whether the motion from ``state`` (nx,) at ``t`` (s) starts in a layer, from where
+        :meth:`steps_on` makes it."""
+        if self._one_freedom:
+            self._rest = layer_motion(self._system, t, state, self._tolerance, START_REACH)
+        return self.under_way
 
     def crossing(self, result: StepResult) -> float | None:
         """When (s) the step of ``result`` passes a singular configuration that has not been
@@ -797,6 +845,15 @@ class CriticalPassages:
             )
         except (ValueError, EvaluationError, np.linalg.LinAlgError):
             return []  # forces have changed, and it turns back
+
+    def steps_to(self, t: float, state: FloatArray, end: float) -> list[tuple[StepResult, float]]:
+        """The steps from ``state`` (nx,) at ``t`` (s), where one of a passage begins, to ``end``
+        (s) within that step; none where the residual counts as zero.
+
+        Dense output between the points of a layer is less accurate than they are.
+        """
+        self._rest = layer_motion(self._system, t, state, self._tolerance, SEARCH)
+        return self.steps_on(t, state, end)
 
     def _along(self, passage: PassageAlongCurve) -> list[tuple[StepResult, float]]:
         """The ``passage`` as steps from node to node."""

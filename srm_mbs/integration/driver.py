@@ -380,6 +380,11 @@ def integrate(
             dense = step_dense(system, method.scheme, start, result, t)
             stop = events.after_step(result.t, t, x, dense)
         if stop is not None:
+            if passages is not None and result.placement == "critical" and stop.time < t:
+                to_event = passages.steps_to(result.t, start, stop.time)
+                if to_event:
+                    record.steps[-1:], record.times[-1:] = map(list, zip(*to_event))
+                    stop = stop._replace(state=record.last_state)
             record.mark_stopped(stop)
             return True
         if tick is not None:

@@ -5,6 +5,7 @@
 #include <complex>
 #include <numeric>
 
+#include "errors.hpp"
 #include "linear.hpp"
 
 namespace srm {
@@ -700,6 +701,41 @@ std::vector<PassagePoint> passage_along_curve(System& system, MotionAlongCurve& 
         return Passage(closures, motion, t, state, end, rtol, collocation, constants).points();
     } catch (const NoPassage&) {
         motion.begun = false;
+        return {};
+    }
+}
+
+std::optional<MotionAlongCurve> motion_in_layer(System& system, double t,
+                                                const std::vector<double>& state, double time_unit,
+                                                double tolerance, double reach,
+                                                const Constants& constants) {
+    const int nv = system.nv;
+    UnitClosures closures(system, time_unit);
+    if (closures.n - system.structural_rank() != 1) return {};
+    try {
+        const std::vector<double> still(2 * nv, 0.0);
+        auto critical = critical_of_passage(closures, t, state.data(), still.data(), t, constants);
+        if (!critical ||
+            !(std::abs(critical->residual) > std::max(tolerance, constants.rounded_residual)))
+            return {};
+        MotionAlongCurve motion{std::move(*critical), time_unit, false};
+        const SaddleCurve curve(closures, motion, state, t, constants);
+        double along = system.driven() ? curve.along[nv] / time_unit : 0.0;
+        for (int j = 0; j < nv; ++j) along += curve.along[j] * state[system.nq + j] / closures.unit(j);
+        if (along == 0.0 || !(std::max(std::abs(curve.beta), curve.width) < reach)) return {};
+        // Of the rates as they are: rounding turns them by more than it changes their size.
+        system.evaluate(t, state.data(), System::ZoneView{});
+        std::vector<double> momentum(nv);
+        system.mass_times(&state[system.nq], momentum.data());
+        motion.energy = 0.5 * dot(&state[system.nq], momentum.data(), nv);
+        motion.begun = true;
+        motion.side = curve.side;
+        motion.beta = curve.beta;
+        motion.start = along > 0.0 ? -reach : reach;
+        return motion;
+    } catch (const NoPassage&) {
+        return {};
+    } catch (const EvaluationError&) {
         return {};
     }
 }

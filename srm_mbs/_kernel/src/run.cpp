@@ -55,6 +55,18 @@ void StepRecords::append(const StepResult& r, double t_new, int placement) {
     held.push_back(r.held ? 1.0 : 0.0);
 }
 
+void StepRecords::drop_last(const StepResult& r) {
+    for (auto* numbers : {&times, &ranks, &error_ratios, &placements, &stiff, &held})
+        numbers->pop_back();
+    const auto shorten = [](auto& values, std::size_t count) {
+        values.erase(values.end() - count, values.end());
+    };
+    shorten(states, r.state.size());
+    shorten(rates, r.rates.size());
+    shorten(corrections, r.correction.size());
+    shorten(sigmas, r.sigmas.size());
+}
+
 void StepRecords::clear() {
     for (auto* values : {&times, &states, &corrections, &sigmas, &ranks, &error_ratios,
                          &placements, &stiff, &held, &breaks, &break_rates})
@@ -431,6 +443,26 @@ Stop Run::make_prepared() {
         control->moved(t_);
     }
     return t_ < t_end() ? Stop::chunk : Stop::finished;
+}
+
+bool Run::end_at(double begin, const std::vector<double>& from, double end, double time_unit,
+                 double reach) {
+    auto motion = motion_in_layer(system, begin, from, time_unit, singular_tolerance_, reach,
+                                  constants());
+    if (!motion) return false;
+    std::vector<PassagePoint> points;
+    try {
+        points = passage_along_curve(system, *motion, begin, from, end, step.norm.rtol,
+                                     collocation_, constants());
+    } catch (const EvaluationError&) {
+    }
+    if (points.size() < 2) return false;
+    records.drop_last(last());
+    --made_;
+    prepared_.clear();
+    prepare(points);
+    while (!prepared_.empty()) make_prepared();
+    return true;
 }
 
 // Moves to the end t of an accepted step.

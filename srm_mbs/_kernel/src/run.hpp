@@ -91,6 +91,8 @@ struct StepRecords {
     // Makes room for the first steps, of the sizes of `result`: short runs need no more.
     void reserve(const StepResult& result);
     void append(const StepResult& result, double t_new, int placement);
+    // Removes the last step, which is `result`.
+    void drop_last(const StepResult& result);
     void clear();
 };
 
@@ -139,6 +141,11 @@ public:
     // steps of that length are counted from here.
     Stop go_on(double end, double first, double last, bool forces_jump, double grid,
                double seconds);
+
+    // Lets the step of a passage that was made last, from `from` at `begin`, end at `end` within it:
+    // CriticalPassages.steps_to in integration/critical_passages.py; whether it does.
+    bool end_at(double begin, const std::vector<double>& from, double end, double time_unit,
+                double reach);
 
     double t() const { return t_; }
     double last_h() const { return h_; }

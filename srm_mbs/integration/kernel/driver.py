@@ -202,6 +202,8 @@ def integrate(
                 dense = CompiledStepDense(run, system, start)
                 stop = events.after_step(t_start, t, state, dense)
                 if stop is not None:
+                    if stop.time < t and run.end_at(t_start, start, stop.time, system):
+                        stop = stop._replace(state=core.state)
                     record.mark_stopped(stop)
                     break
             t_start, start = t, state

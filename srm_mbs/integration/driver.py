@@ -95,6 +95,8 @@ class EndOfSteps(NamedTuple):
         (nx,); None where the dense output has to find it.
     stiff
         Whether the last step was stiff.
+    on_curve
+        Whether they end on the curve past a critical configuration.
     """
 
     start: float
@@ -103,6 +105,7 @@ class EndOfSteps(NamedTuple):
     time: float
     state: FloatArray | None
     stiff: bool
+    on_curve: bool = False
 
 
 @dataclass
@@ -267,7 +270,8 @@ class RunRecord:
         # The dense output of a single step is that in which the event was found.
         state = self.stop_state if self.made == 1 else None
         time = self.times[-1] if self.stop is None else self.stop
-        return EndOfSteps(self.t0, last.t, self.times[-1], time, state, last.stiff)
+        on_curve = last.placement == "critical" and time == self.times[-1]
+        return EndOfSteps(self.t0, last.t, self.times[-1], time, state, last.stiff, on_curve)
 
     def close(self) -> None:
         """Let go of the steps, which arrays have, and of what made them."""

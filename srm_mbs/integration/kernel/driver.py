@@ -89,7 +89,7 @@ class CompiledRecord(RunRecord):
         last, t = core.last(), core.t
         state = self.stop_state if core.count == 1 else None
         time = t if self.stop is None else self.stop
-        return EndOfSteps(self.t0, last.t, t, time, state, last.stiff)
+        return EndOfSteps(self.t0, last.t, t, time, state, last.stiff, last.critical and time == t)
 
     def _take_records(self) -> Any:
         start = (self.t0, self.x0) if self.rest is None else self.rest

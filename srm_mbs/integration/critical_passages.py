@@ -45,6 +45,9 @@ configuration is looked for."""
 PASSED = 0.5
 """Distance of the predicted passage from the critical configuration, over that of the start of the
 step, below which the step passes it.  In a wide layer the curve itself tells."""
+FARTHEST = 1.5
+"""Distance (units) of a critical configuration that is expected ahead from which a motion waits:
+another one may lie between."""
 EXAMINED_AGAIN = 0.7
 """Fall of sigma after which a motion that passes no critical configuration so far is examined
 again."""
@@ -101,6 +104,13 @@ it is then almost as accurate as its quadrature."""
 START_REACH = 0.1
 """Distance (units) from a critical configuration up to which a motion that starts in its layer is
 followed along the curve."""
+FIRST_PART = 0.1
+"""First step after a motion that starts in a layer, over the time in which it leaves that."""
+SHORTENED = 0.5
+"""Length of a panel beyond the layer, over that of one in which the motion slows down too much."""
+LEAST_ENERGY = 0.75
+"""Kinetic energy on a panel beyond the layer, over that at its start, from which polynomials on it
+resolve the time: the rate of that grows without bound where the motion turns back."""
 SMALLEST_REST = 1e-9
 """Rest of a passage, over its whole, that is none."""
 
@@ -332,10 +342,14 @@ class PassageAlongCurve:
         if begun is None:
             at = edges[0]
         for edge in edges[1:]:
-            while at < edge and self._clock < self.end:
-                at = self._panel(at, edge)
+            at = self._panels(at, edge)
+            if at < edge:
+                break
         if self._clock < self.end:
-            self._point(-self._start, self._energy, self._clock)
+            beyond = -self._start
+            if at < edges[-1]:
+                beyond = self._width * float(np.sinh(self._heading * at))
+            self._point(beyond, self._energy, self._clock)
             if self._driven:
                 node, energy, _ = self._found.pop()
                 self._found.append((node, energy, float(node.place[-1])))
@@ -345,6 +359,23 @@ class PassageAlongCurve:
         self.states = np.array([state for state, _ in motion])
         self.rates = np.array([rate for _, rate in motion])
         self.states[0] = self.state
+
+    def _panels(self, at: float, edge: float) -> float:
+        """Go on from ``at`` to the ``edge``, of xi times the heading; where that led.
+
+        Beyond the layer that may be less, where the motion turns back soon.
+        """
+        target = edge
+        while at < edge and self._clock < self.end:
+            try:
+                at, target = self._panel(at, target), edge
+            except ValueError:
+                target = at + SHORTENED * (target - at)
+                if self.exact or at < LAYER:
+                    raise
+                if target - at < SHORTEST_PANEL:
+                    break
+        return at
 
     def _closes(self, beta: float) -> bool:
         """Whether the closures are to hold at ``beta``, also where their residual counts as
@@ -501,13 +532,15 @@ class PassageAlongCurve:
         weights, own = np.vstack([integrals, w]), np.concatenate([[0.0], x, [1.0]])
         # Of the evaluation made last.
         mass = self.critical.geometry.mass()
+        beyond = not (self._driven or self.exact or a < LAYER)
+        least = LEAST_ENERGY * self._energy if beyond else 0.0
         while True:
             xi = self._heading * (a + (b - a) * x)
             slope = self._width * np.cosh(xi) * self._heading * (b - a)
             betas = self._width * np.sinh(xi)
             start = self._width * np.sinh(self._heading * a)
             energy = self._energy + self._found[-1][0].power * (betas - start)
-            if not (energy > 0.0).all():
+            if not (energy > least).all():
                 raise ValueError("the energy does not suffice to pass")
             predicted = [
                 self._predicted(*one, mass) for one in zip(betas.tolist(), energy.tolist())
@@ -523,7 +556,7 @@ class PassageAlongCurve:
         nodes = [self._evaluated(*one) for one in zip(places, betas.tolist(), rates, t.tolist())]
         for _ in range(SWEEPS):
             energies = self._energy + weights @ (slope * [node.power for node in nodes])
-            if not (energies > 0.0).all():
+            if not (energies > least).all():
                 raise ValueError("the energy does not suffice to pass")
             speeds = [self._speed(*one) for one in zip(nodes, energies.tolist())]
             if not (np.array(speeds) * slope > 0.0).all():
@@ -659,9 +692,10 @@ def examined_passages(
 
 
 def step_from_layer(v: FloatArray, unit: FloatArray) -> float:
-    """The first step (s) after a motion that starts in a layer with the rates ``v`` (nv,): about
-    the time in which it leaves that.  ``unit`` (nv,): of the coordinates."""
-    return START_REACH / float(np.abs(v / unit).max())
+    """The first step (s) after a motion that starts in a layer with the rates ``v`` (nv,): a part
+    of the time in which it leaves that, as it may turn back soon.  ``unit`` (nv,): of the
+    coordinates."""
+    return FIRST_PART * START_REACH / float(np.abs(v / unit).max())
 
 
 def layer_motion(
@@ -768,7 +802,7 @@ class CriticalPassages:
             self._known, self._examine_below = False, np.inf
 
     def steps_past(
-        self, t: float, state: FloatArray, rate: FloatArray, zero: float, end: float
+        self, t: float, state: FloatArray, rate: FloatArray, zero: float, end: float, expected: bool
     ) -> list[tuple[StepResult, float]]:
         """The steps of the motion past the critical configuration next to a passage.
 
@@ -780,6 +814,8 @@ class CriticalPassages:
             When the passage is expected (s).
         end
             End of the smooth interval (s).
+        expected
+            Whether the passage is only expected: no step was made that passes it.
 
         Returns
         -------
@@ -804,6 +840,9 @@ class CriticalPassages:
         left, covered = (geometry.difference(critical.q, x) for x in (place, begin))
         self._known = bool(np.linalg.norm(left) < PASSED * np.linalg.norm(covered))
         residual = critical.residual
+        if abs(residual) > ROUNDED_RESIDUAL and expected and np.linalg.norm(covered) > FARTHEST:
+            self._known = False
+            return []
         if abs(residual) <= ROUNDED_RESIDUAL:
             # Steps pass it in any turn.  A passage along a curve depends on where a search begins,
             # and whether it ends: it has one of its own.
@@ -820,7 +859,9 @@ class CriticalPassages:
                 )
                 steps = self._along(passage)
             except (ValueError, EvaluationError, np.linalg.LinAlgError):
-                pass  # steps pass it as well as they can, and the message says so
+                # Steps pass it as well as they can, and the message says so.  A motion that has
+                # still to turn back is examined again.
+                self._known = self._known and not (self._one_freedom and expected)
         if self._known or steps:
             self.examined.append(ExaminedPassage(zero, residual, avoided, bool(steps)))
         return steps

@@ -395,16 +395,16 @@ def integrate(
             call_progress(tick, t, result.h, x)
         return False
 
-    def pass_critical(zero: float | None) -> bool:
-        """Make the passage expected at ``zero`` (s), or go on with one that is under way, if steps
-        cannot make it; whether it was made."""
+    def pass_critical(zero: float | None, expected: bool) -> bool:
+        """Make the passage at ``zero`` (s), which is ``expected`` or lies in a step, or go on with
+        one that is under way, if steps cannot make it; whether it was made."""
         if passages is None or (zero is None and not passages.under_way):
             return False
         end = t_end if breakpoints is None else breakpoints.end
         if zero is None:
             past = passages.steps_on(t, x, end)
         else:
-            past = passages.steps_past(t, x, memory.rate, zero, end)
+            past = passages.steps_past(t, x, memory.rate, zero, end, expected)
         if past and not any(accept(step, t_new) for step, t_new in past):
             control.moved(t)
         return bool(past)
@@ -428,7 +428,7 @@ def integrate(
                 control.set_target_time(breakpoints.end)
                 rest_limit = longest_from_rest(system, memory, norm, breakpoints.end - t)
             if passages is not None and passages.under_way:
-                if not pass_critical(None):
+                if not pass_critical(None, False):
                     memory = restarted()
                 continue
             limit = min(max_step, system.step_limit(x), jump.limit, rest_limit)
@@ -438,7 +438,7 @@ def integrate(
                 continue
             h = proposal.h
             expected = control.next_zero()
-            if pass_critical(None if passages is None else passages.unexamined(expected, t)):
+            if pass_critical(None if passages is None else passages.unexamined(expected, t), True):
                 continue
             last = proposal.t_new == (t_end if breakpoints is None else breakpoints.end)
             failure = _no_further_step(record, t, h, last, t_end, unevaluated, words)
@@ -453,7 +453,7 @@ def integrate(
                 result = None
                 unevaluated = RunFailure(StopReason.NOT_EVALUATED, str(error))
             if result is not None and pass_critical(
-                None if passages is None else passages.crossing(result)
+                None if passages is None else passages.crossing(result), False
             ):
                 continue
             if result is not None and jump.misses(proposal, memory, result, control.adaptive):

@@ -1,4 +1,5 @@
-"""Starts and actions of events in the layers of mechanisms whose branches almost cross.
+"""Starts, actions of events and turns in and beside the layers of mechanisms whose branches almost
+cross.
 
 The reference has no closures: the energy integral of test_almost_singular, which gives the state
 anywhere in a layer, and the time there.
@@ -6,6 +7,7 @@ anywhere in a layer, and the time there.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -156,3 +158,22 @@ def test_a_simulator_may_be_set_into_a_layer(backend: str) -> None:
     for _ in range(20):
         simulator.step(1e-2)
     assert max(reference.errors(simulator.t, simulator.q, simulator.v)) < 1e-5
+
+
+@on_both
+@pytest.mark.parametrize(
+    ("d", "stiffness"), [(1e-9, 110.0), (4e-11, 110.0), (4e-8, 114.0), (1e-6, 114.0)]
+)
+def test_a_motion_that_turns_back_soon_beyond_a_layer_returns_through_it(
+    d: float, stiffness: float, backend: str
+) -> None:
+    """A spring turns it 0.01 to 0.04 rad beyond; it comes to its start with reversed rates."""
+    ideal = slider_crank(d)
+    spring = srm.TorsionSpring("crank", stiffness=stiffness, rest_angle=0.3)
+    mechanism = replace(ideal, forces=(spring,))
+    back = srm.Event(lambda t, q, v: q[0] - ideal.q0[0], direction=-1, terminal=True)
+    solution = srm.simulate(mechanism, 3.0, rtol=1e-9, events=back, backend=backend, **EXACT)
+    assert solution.status == "event", solution.message
+    assert [passage.kind for passage in solution.crossings] == ["avoided", "avoided"]
+    np.testing.assert_allclose(solution.q[-1], mechanism.q0, atol=1e-9)
+    np.testing.assert_allclose(solution.v[-1], -mechanism.v0, atol=1e-8)

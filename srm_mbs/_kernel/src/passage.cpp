@@ -254,10 +254,11 @@ public:
         double at = begun ? heading_ * std::asinh(beta / width_) : edges.front();
         motion.side = curve_.side;
         motion.begun = false;
-        for (std::size_t k = 1; k < edges.size(); ++k)
-            while (at < edges[k] && clock_ < end_) at = panel(at, edges[k]);
+        for (std::size_t k = 1; k < edges.size() && !(at < edges[k - 1]); ++k)
+            at = panels(at, edges[k]);
         if (clock_ < end_) {
-            point(-start, energy_, clock_);
+            const bool whole = !(at < edges.back());
+            point(whole ? -start : width_ * std::sinh(heading_ * at), energy_, clock_);
             if (driven_) found_.back().t = found_.back().node.time;
         }
     }
@@ -477,6 +478,23 @@ private:
             throw NoPassage{};
     }
 
+    // Goes on from `at` to the edge, of xi times the heading; returns where that led.  Beyond the
+    // layer that may be less, where the motion turns back soon.
+    double panels(double at, double edge) {
+        double target = edge;
+        while (at < edge && clock_ < end_) {
+            try {
+                at = panel(at, target);
+                target = edge;
+            } catch (const NoPassage&) {
+                target = at + constants_.panel_shortened * (target - at);
+                if (motion_.exact || at < constants_.layer) throw;
+                if (target - at < constants_.shortest_panel) break;
+            }
+        }
+        return at;
+    }
+
     // Goes on along the panel from a to b, of xi times the heading, or only to a place behind the
     // end of the passage; returns where it led.
     double panel(double a, double b) {
@@ -488,6 +506,8 @@ private:
         Vector own{0.0};
         own.insert(own.end(), x.begin(), x.end());
         own.push_back(1.0);
+        const bool beyond = !(driven_ || motion_.exact || a < constants_.layer);
+        const double least = beyond ? constants_.least_energy * energy_ : 0.0;
         const auto with_start = [](double first, const Vector& values) {
             Vector out{first};
             out.insert(out.end(), values.begin(), values.end());
@@ -497,7 +517,7 @@ private:
             for (int i = 0; i < count_; ++i) {
                 const double xi = heading_ * (a + (b - a) * x[i]), beta = width_ * std::sinh(xi);
                 const double energy = energy_ + power * (beta - start);
-                if (!(energy > 0.0)) throw NoPassage{};
+                if (!(energy > least)) throw NoPassage{};
                 double rate;
                 nodes[i] = predicted(beta, energy, rate);
                 slope[i] = width_ * std::cosh(xi) * heading_ * (b - a);
@@ -515,7 +535,7 @@ private:
             for (int i = 0; i < count_; ++i) works[i] = slope[i] * nodes[i].power;
             integrate(works, energy_, energies);
             for (double value : energies)
-                if (!(value > 0.0)) throw NoPassage{};
+                if (!(value > least)) throw NoPassage{};
             for (int i = 0; i < count_; ++i) {
                 durations[i] = slope[i] / speed(nodes[i], energies[i]);
                 if (!(durations[i] > 0.0)) throw NoPassage{};

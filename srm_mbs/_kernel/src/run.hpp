@@ -178,7 +178,7 @@ public:
 private:
     bool leaves_closures_open(const StepResult& result);
     std::optional<double> crossing(const StepResult& result) const;
-    bool examine(double zero);
+    bool examine(double zero, bool expected);
     double late_past_layers(const StepResult& result) const;
     bool misses_jump(const Proposal& proposal, const StepResult& result);
     void follow(MotionAlongCurve motion);

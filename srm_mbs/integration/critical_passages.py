@@ -45,6 +45,9 @@ configuration is looked for."""
 PASSED = 0.5
 """Distance of the predicted passage from the critical configuration, over that of the start of the
 step, below which the step passes it.  In a wide layer the curve itself tells."""
+FARTHEST = 1.5
+"""Distance (units) of a critical configuration that is expected ahead from which a motion waits:
+another one may lie between."""
 EXAMINED_AGAIN = 0.7
 """Fall of sigma after which a motion that passes no critical configuration so far is examined
 again."""
@@ -98,6 +101,16 @@ CUT, CUT_FROM = 1.1, 0.9
 """Length of a panel in which the passage is to stop, over the one that is predicted to lead there,
 and the length, over that of the whole panel, below which it is cut so.  Interpolation to a time in
 it is then almost as accurate as its quadrature."""
+START_REACH = 0.1
+"""Distance (units) from a critical configuration up to which a motion that starts in its layer is
+followed along the curve."""
+FIRST_PART = 0.1
+"""First step after a motion that starts in a layer, over the time in which it leaves that."""
+SHORTENED = 0.5
+"""Length of a panel beyond the layer, over that of one in which the motion slows down too much."""
+LEAST_ENERGY = 0.75
+"""Kinetic energy on a panel beyond the layer, over that at its start, from which polynomials on it
+resolve the time: the rate of that grows without bound where the motion turns back."""
 SMALLEST_REST = 1e-9
 """Rest of a passage, over its whole, that is none."""
 
@@ -329,10 +342,14 @@ class PassageAlongCurve:
         if begun is None:
             at = edges[0]
         for edge in edges[1:]:
-            while at < edge and self._clock < self.end:
-                at = self._panel(at, edge)
+            at = self._panels(at, edge)
+            if at < edge:
+                break
         if self._clock < self.end:
-            self._point(-self._start, self._energy, self._clock)
+            beyond = -self._start
+            if at < edges[-1]:
+                beyond = self._width * float(np.sinh(self._heading * at))
+            self._point(beyond, self._energy, self._clock)
             if self._driven:
                 node, energy, _ = self._found.pop()
                 self._found.append((node, energy, float(node.place[-1])))
@@ -342,6 +359,23 @@ class PassageAlongCurve:
         self.states = np.array([state for state, _ in motion])
         self.rates = np.array([rate for _, rate in motion])
         self.states[0] = self.state
+
+    def _panels(self, at: float, edge: float) -> float:
+        """Go on from ``at`` to the ``edge``, of xi times the heading; where that led.
+
+        Beyond the layer that may be less, where the motion turns back soon.
+        """
+        target = edge
+        while at < edge and self._clock < self.end:
+            try:
+                at, target = self._panel(at, target), edge
+            except ValueError:
+                target = at + SHORTENED * (target - at)
+                if self.exact or at < LAYER:
+                    raise
+                if target - at < SHORTEST_PANEL:
+                    break
+        return at
 
     def _closes(self, beta: float) -> bool:
         """Whether the closures are to hold at ``beta``, also where their residual counts as
@@ -498,13 +532,15 @@ class PassageAlongCurve:
         weights, own = np.vstack([integrals, w]), np.concatenate([[0.0], x, [1.0]])
         # Of the evaluation made last.
         mass = self.critical.geometry.mass()
+        beyond = not (self._driven or self.exact or a < LAYER)
+        least = LEAST_ENERGY * self._energy if beyond else 0.0
         while True:
             xi = self._heading * (a + (b - a) * x)
             slope = self._width * np.cosh(xi) * self._heading * (b - a)
             betas = self._width * np.sinh(xi)
             start = self._width * np.sinh(self._heading * a)
             energy = self._energy + self._found[-1][0].power * (betas - start)
-            if not (energy > 0.0).all():
+            if not (energy > least).all():
                 raise ValueError("the energy does not suffice to pass")
             predicted = [
                 self._predicted(*one, mass) for one in zip(betas.tolist(), energy.tolist())
@@ -520,7 +556,7 @@ class PassageAlongCurve:
         nodes = [self._evaluated(*one) for one in zip(places, betas.tolist(), rates, t.tolist())]
         for _ in range(SWEEPS):
             energies = self._energy + weights @ (slope * [node.power for node in nodes])
-            if not (energies > 0.0).all():
+            if not (energies > least).all():
                 raise ValueError("the energy does not suffice to pass")
             speeds = [self._speed(*one) for one in zip(nodes, energies.tolist())]
             if not (np.array(speeds) * slope > 0.0).all():
@@ -655,6 +691,45 @@ def examined_passages(
     return CriticalPassages(branch_system, method.scheme, norm, tolerance)
 
 
+def step_from_layer(v: FloatArray, unit: FloatArray) -> float:
+    """The first step (s) after a motion that starts in a layer with the rates ``v`` (nv,): a part
+    of the time in which it leaves that, as it may turn back soon.  ``unit`` (nv,): of the
+    coordinates."""
+    return FIRST_PART * START_REACH / float(np.abs(v / unit).max())
+
+
+def layer_motion(
+    system: BranchSystem, t: float, state: FloatArray, tolerance: float, reach: float
+) -> PlaceOnCurve | None:
+    """The motion from ``state`` (nx,) at ``t`` (s) in the layer of a critical configuration with a
+    residual above ``tolerance`` (row units), to be followed along the curve up to the distance
+    ``reach`` (units) from that; None if there is none.
+
+    The energy is that of the rates as they are: rounding turns them by more than it changes their
+    size.
+    """
+    analysis = system.singularities
+    q, v = analysis.split(state)
+    geometry = analysis.geometry(analysis.q0, t)
+    place, rates = geometry.at(q, t), geometry.rates(v)
+    try:
+        critical = critical_configuration(
+            geometry, analysis.rank, place, SEARCH, (), ROUNDED_RESIDUAL
+        )
+        if critical is None or not abs(critical.residual) > max(tolerance, ROUNDED_RESIDUAL):
+            return None
+        curve = CurveThroughSaddle(critical, place, False)
+        geometry.closure(place)
+    except (ValueError, EvaluationError, np.linalg.LinAlgError):
+        return None
+    along, own = float(curve.along @ rates), rates[: len(v)]
+    if along == 0.0 or not max(abs(curve.beta), curve.width) < reach:
+        return None
+    energy = 0.5 * float(own @ geometry.mass() @ own)
+    begin = -float(np.sign(along)) * reach
+    return PlaceOnCurve(critical, False, curve, begin, curve.beta, energy)
+
+
 class CriticalPassages:
     """Examines the singular configurations that steps would pass; used by the drivers.
 
@@ -693,6 +768,13 @@ class CriticalPassages:
         """Whether a passage stopped on its way; :meth:`steps_on` goes on with it."""
         return self._rest is not None
 
+    def begin(self, t: float, state: FloatArray) -> bool:
+        """Whether the motion from ``state`` (nx,) at ``t`` (s) starts in a layer, from where
+        :meth:`steps_on` makes it."""
+        if self._one_freedom:
+            self._rest = layer_motion(self._system, t, state, self._tolerance, START_REACH)
+        return self.under_way
+
     def crossing(self, result: StepResult) -> float | None:
         """When (s) the step of ``result`` passes a singular configuration that has not been
         examined; None if it does not."""
@@ -720,7 +802,7 @@ class CriticalPassages:
             self._known, self._examine_below = False, np.inf
 
     def steps_past(
-        self, t: float, state: FloatArray, rate: FloatArray, zero: float, end: float
+        self, t: float, state: FloatArray, rate: FloatArray, zero: float, end: float, expected: bool
     ) -> list[tuple[StepResult, float]]:
         """The steps of the motion past the critical configuration next to a passage.
 
@@ -732,6 +814,8 @@ class CriticalPassages:
             When the passage is expected (s).
         end
             End of the smooth interval (s).
+        expected
+            Whether the passage is only expected: no step was made that passes it.
 
         Returns
         -------
@@ -756,6 +840,9 @@ class CriticalPassages:
         left, covered = (geometry.difference(critical.q, x) for x in (place, begin))
         self._known = bool(np.linalg.norm(left) < PASSED * np.linalg.norm(covered))
         residual = critical.residual
+        if abs(residual) > ROUNDED_RESIDUAL and expected and np.linalg.norm(covered) > FARTHEST:
+            self._known = False
+            return []
         if abs(residual) <= ROUNDED_RESIDUAL:
             # Steps pass it in any turn.  A passage along a curve depends on where a search begins,
             # and whether it ends: it has one of its own.
@@ -772,7 +859,9 @@ class CriticalPassages:
                 )
                 steps = self._along(passage)
             except (ValueError, EvaluationError, np.linalg.LinAlgError):
-                pass  # steps pass it as well as they can, and the message says so
+                # Steps pass it as well as they can, and the message says so.  A motion that has
+                # still to turn back is examined again.
+                self._known = self._known and not (self._one_freedom and expected)
         if self._known or steps:
             self.examined.append(ExaminedPassage(zero, residual, avoided, bool(steps)))
         return steps
@@ -797,6 +886,15 @@ class CriticalPassages:
             )
         except (ValueError, EvaluationError, np.linalg.LinAlgError):
             return []  # forces have changed, and it turns back
+
+    def steps_to(self, t: float, state: FloatArray, end: float) -> list[tuple[StepResult, float]]:
+        """The steps from ``state`` (nx,) at ``t`` (s), where one of a passage begins, to ``end``
+        (s) within that step; none where the residual counts as zero.
+
+        Dense output between the points of a layer is less accurate than they are.
+        """
+        self._rest = layer_motion(self._system, t, state, self._tolerance, SEARCH)
+        return self.steps_on(t, state, end)
 
     def _along(self, passage: PassageAlongCurve) -> list[tuple[StepResult, float]]:
         """The ``passage`` as steps from node to node."""

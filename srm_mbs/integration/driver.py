@@ -95,6 +95,8 @@ class EndOfSteps(NamedTuple):
         (nx,); None where the dense output has to find it.
     stiff
         Whether the last step was stiff.
+    on_curve
+        Whether they end on the curve past a critical configuration.
     """
 
     start: float
@@ -103,6 +105,7 @@ class EndOfSteps(NamedTuple):
     time: float
     state: FloatArray | None
     stiff: bool
+    on_curve: bool = False
 
 
 @dataclass
@@ -267,7 +270,8 @@ class RunRecord:
         # The dense output of a single step is that in which the event was found.
         state = self.stop_state if self.made == 1 else None
         time = self.times[-1] if self.stop is None else self.stop
-        return EndOfSteps(self.t0, last.t, self.times[-1], time, state, last.stiff)
+        on_curve = last.placement == "critical" and time == self.times[-1]
+        return EndOfSteps(self.t0, last.t, self.times[-1], time, state, last.stiff, on_curve)
 
     def close(self) -> None:
         """Let go of the steps, which arrays have, and of what made them."""
@@ -380,22 +384,27 @@ def integrate(
             dense = step_dense(system, method.scheme, start, result, t)
             stop = events.after_step(result.t, t, x, dense)
         if stop is not None:
+            if passages is not None and result.placement == "critical" and stop.time < t:
+                to_event = passages.steps_to(result.t, start, stop.time)
+                if to_event:
+                    record.steps[-1:], record.times[-1:] = map(list, zip(*to_event))
+                    stop = stop._replace(state=record.last_state)
             record.mark_stopped(stop)
             return True
         if tick is not None:
             call_progress(tick, t, result.h, x)
         return False
 
-    def pass_critical(zero: float | None) -> bool:
-        """Make the passage expected at ``zero`` (s), or go on with one that is under way, if steps
-        cannot make it; whether it was made."""
+    def pass_critical(zero: float | None, expected: bool) -> bool:
+        """Make the passage at ``zero`` (s), which is ``expected`` or lies in a step, or go on with
+        one that is under way, if steps cannot make it; whether it was made."""
         if passages is None or (zero is None and not passages.under_way):
             return False
         end = t_end if breakpoints is None else breakpoints.end
         if zero is None:
             past = passages.steps_on(t, x, end)
         else:
-            past = passages.steps_past(t, x, memory.rate, zero, end)
+            past = passages.steps_past(t, x, memory.rate, zero, end, expected)
         if past and not any(accept(step, t_new) for step, t_new in past):
             control.moved(t)
         return bool(past)
@@ -419,7 +428,7 @@ def integrate(
                 control.set_target_time(breakpoints.end)
                 rest_limit = longest_from_rest(system, memory, norm, breakpoints.end - t)
             if passages is not None and passages.under_way:
-                if not pass_critical(None):
+                if not pass_critical(None, False):
                     memory = restarted()
                 continue
             limit = min(max_step, system.step_limit(x), jump.limit, rest_limit)
@@ -429,7 +438,7 @@ def integrate(
                 continue
             h = proposal.h
             expected = control.next_zero()
-            if pass_critical(None if passages is None else passages.unexamined(expected, t)):
+            if pass_critical(None if passages is None else passages.unexamined(expected, t), True):
                 continue
             last = proposal.t_new == (t_end if breakpoints is None else breakpoints.end)
             failure = _no_further_step(record, t, h, last, t_end, unevaluated, words)
@@ -444,7 +453,7 @@ def integrate(
                 result = None
                 unevaluated = RunFailure(StopReason.NOT_EVALUATED, str(error))
             if result is not None and pass_critical(
-                None if passages is None else passages.crossing(result)
+                None if passages is None else passages.crossing(result), False
             ):
                 continue
             if result is not None and jump.misses(proposal, memory, result, control.adaptive):

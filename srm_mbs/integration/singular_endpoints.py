@@ -147,6 +147,18 @@ class NodeMaker(Protocol):
         """
 
 
+class LayerStart(Protocol):
+    """Begins motions in the layers of critical configurations that are nearly singular."""
+
+    @property
+    def under_way(self) -> bool:
+        """Whether it began one that is still to be made."""
+
+    def begin(self, t: float, state: FloatArray) -> bool:
+        """Whether the motion from ``state`` (nx,) at ``t`` (s) starts in a layer, and is to be
+        followed along its curve: its first stage is not needed."""
+
+
 class MakesNodes(ABC):
     """A system that makes its nodes itself, as one in the kernel does; others take those of the
     reference."""
@@ -634,6 +646,7 @@ def start(
     norm: ErrorNorm,
     t_end: float,
     memory: IntegratorState | None = None,
+    layers: LayerStart | None = None,
 ) -> IntegratorState:
     """The memory of ``method`` at the initial state, also on a singular configuration.
 
@@ -644,6 +657,8 @@ def start(
     memory
         Of a run that continues here, at a breakpoint, with the first stage evaluated directly;
         changed here.  Such a motion need not depart from the singular configuration.
+    layers
+        Begins motions in layers; None where steps are to leave them.
 
     Raises
     ------
@@ -658,6 +673,8 @@ def start(
         memory = method.start(system, t, state, norm)
     analysis = system.singularities
     if analysis is None or not memory.sigma < NEAR_SINGULAR_SIGMA:
+        return memory
+    if layers is not None and layers.begin(t, state):
         return memory
     q, v = analysis.split(state)
     geometry = analysis.geometry(q, t)

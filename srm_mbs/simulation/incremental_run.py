@@ -24,15 +24,19 @@ from srm_mbs.integration.control.step_size import (
     StepSizeControl,
     initial_step,
 )
-from srm_mbs.integration.critical_passages import CriticalPassages, examined_passages
+from srm_mbs.integration.critical_passages import (
+    CriticalPassages,
+    examined_passages,
+    step_from_layer,
+)
 from srm_mbs.integration.driver import RunStatus, integrate
 from srm_mbs.integration.generated.code import load_code
 from srm_mbs.integration.kernel.driver import why_stopped
 from srm_mbs.integration.kernel.marshalling import state_struct
-from srm_mbs.integration.kernel.run import CHUNK, CompiledRun, ReturnReason
+from srm_mbs.integration.kernel.run import CHUNK, CompiledLayerStart, CompiledRun, ReturnReason
 from srm_mbs.integration.kernel.system import Evaluator, make_kernel_system
 from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Method
-from srm_mbs.integration.singular_endpoints import start
+from srm_mbs.integration.singular_endpoints import LayerStart, start
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.result import Statistics
 from srm_mbs.simulation.runner import placed_control
@@ -91,18 +95,38 @@ class IncrementalRun(ABC):
         """
         self._hold(t, force)
         self._evaluator.between(-np.inf, np.inf)
-        memory = start(self._evaluator, self.method, t, state, self.norm, smooth_until)
-        order = self.method.scheme.controller_order or 1
-        first = initial_step(self._evaluator, state, memory, self.norm, span, order, t)
-        self._begin(t, state, memory, first)
+        layers = self._layer_start()
+        memory = start(
+            self._evaluator, self.method, t, state, self.norm, smooth_until, layers=layers
+        )
+        if layers is not None and layers.under_way:
+            first = step_from_layer(
+                self.system.split(state)[1], self.system.mechanism.structure.units.coordinate
+            )
+        else:
+            order = self.method.scheme.controller_order or 1
+            first = initial_step(self._evaluator, state, memory, self.norm, span, order, t)
+        self._begin(t, state, memory, first, layers)
+
+    @abstractmethod
+    def _layer_start(self) -> LayerStart | None:
+        """Begins motions in layers; None where steps are to leave them."""
 
     def _hold(self, t: float, force: FloatArray) -> None:
         """Let ``force`` (nv,) act from ``t`` (s) on."""
         self.held.only(force)
 
     @abstractmethod
-    def _begin(self, t: float, state: FloatArray, memory: IntegratorState, first: float) -> None:
-        """Start from an integrator state with a step of length ``first`` (s)."""
+    def _begin(
+        self,
+        t: float,
+        state: FloatArray,
+        memory: IntegratorState,
+        first: float,
+        layers: Any,
+    ) -> None:
+        """Start from an integrator state with a step of length ``first`` (s), or from what
+        ``layers`` (:meth:`_layer_start`) began."""
 
     @abstractmethod
     def go_on(
@@ -217,8 +241,17 @@ class KernelRun(IncrementalRun):
         super()._hold(t, force)
         self._kernel_system.hold(t, force, False)
 
-    def _begin(self, t: float, state: FloatArray, memory: IntegratorState, first: float) -> None:
-        self._run.begin(t, state, memory, first)
+    def _layer_start(self) -> CompiledLayerStart | None:
+        if self._passages() is None:
+            return None
+        tolerance = self.options.singular_tolerance
+        return CompiledLayerStart(self._kernel_system, self.system, tolerance)
+
+    def _begin(
+        self, t: float, state: FloatArray, memory: IntegratorState, first: float, layers: Any
+    ) -> None:
+        motion = None if layers is None else layers.motion
+        self._run.begin(t, state, state_struct(memory), first, motion)
 
     def go_on(
         self,
@@ -286,10 +319,15 @@ class ReferenceRun(IncrementalRun):
     def state(self) -> FloatArray:
         return self._state.copy()
 
-    def _begin(self, t: float, state: FloatArray, memory: IntegratorState, first: float) -> None:
+    def _layer_start(self) -> CriticalPassages | None:
+        return self._passages()
+
+    def _begin(
+        self, t: float, state: FloatArray, memory: IntegratorState, first: float, layers: Any
+    ) -> None:
         _, _, self._placed, self._replaced, _ = self._counts()
         self._t, self._state, self._memory = t, state.copy(), memory
-        self._nearness, self._examined = SingularProximity(), self._passages()
+        self._nearness, self._examined = SingularProximity(), layers
         self._control, self._wrappers = placed_control(self.system, self.options, lambda: first)
 
     def _matters(self, fresh: IntegratorState, span: float) -> bool:

@@ -47,7 +47,11 @@ from srm_mbs.integration.control.step_size import (
     StepSizeControl,
     initial_step,
 )
-from srm_mbs.integration.critical_passages import CriticalPassages, examined_passages
+from srm_mbs.integration.critical_passages import (
+    CriticalPassages,
+    examined_passages,
+    step_from_layer,
+)
 from srm_mbs.integration.dense_output import DenseOutput, StepData
 from srm_mbs.integration.driver import EndOfSteps, RunRecord, RunStatus, StepSink
 from srm_mbs.integration.events import EventWatch, MechanismFunction, prepare_events
@@ -58,7 +62,7 @@ from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.driver import CompiledRecord, StepSummary
 from srm_mbs.integration.kernel.events import CompiledEventWatch
 from srm_mbs.integration.kernel.marshalling import state_from
-from srm_mbs.integration.kernel.run import CompiledRun, first_stage
+from srm_mbs.integration.kernel.run import CompiledLayerStart, CompiledRun, first_stage
 from srm_mbs.integration.kernel.system import Evaluator, SuccessiveWorkspaces, shared
 from srm_mbs.integration.messages import (
     MECHANISM,
@@ -645,8 +649,13 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
         handler.sample = sampler(system, problem.held, watch, controller, interval, kernel_system)
         handler.sample(t0, state)
     if evaluator is None:
-        memory = start(system, method, t0, state, norm, handler.end)
+        passages = problem.passages
+        memory = start(system, method, t0, state, norm, handler.end, layers=passages)
         memory.stiff = problem.stiff
+        if passages is not None and passages.under_way:
+            problem.last_step = step_from_layer(
+                system.split(state)[1], problem.mechanism.structure.units.coordinate
+            )
         found = integrate_steps(
             system,
             options,
@@ -662,8 +671,16 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
         handler.done()
         return found
     check_embedded(method.scheme, options.step)
+    layers = None
+    if problem.passages is not None:
+        layers = CompiledLayerStart(kernel_system, system, options.singular_tolerance)
+    first = first_stage(evaluator, method, t0, state, norm, handler.end, problem.stiff, layers)
+    motion = None if layers is None else layers.motion
+    if motion is not None:
+        problem.last_step = step_from_layer(
+            system.split(state)[1], problem.mechanism.structure.units.coordinate
+        )
     given = options.first_step or problem.last_step or None
-    first = first_stage(evaluator, method, t0, state, norm, handler.end, problem.stiff)
     try:
         run = _compiled_run(problem, kernel_system, first, given, handler)
     except ArithmeticError:  # the reference raises the error that says why
@@ -672,6 +689,8 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
             evaluator, norm, options, known, state, smooth_until=handler.end
         )
         run = _compiled_run(problem, kernel_system, first, first_step, handler)
+    if motion is not None:
+        run.begin(t0, state, first, cast(float, given), motion)
     with progress_of(options.progress, system, options.t_end) as tick:
         record = kernel_driver.integrate(
             system,
@@ -1028,11 +1047,23 @@ def assemble_result(
         problem.options.method.scheme,
         FinishedRun(problem, record, counters, kernel_system, result_type),
         t_eval=problem.options.t_eval,
-        events=None if problem.watch is None else problem.watch.found(),
+        events=None if problem.watch is None else _found_events(problem.watch, record),
         status=record.status,
     )
     result.error = record.error
     return result
+
+
+def _found_events(
+    watch: EventWatch | CompiledEventWatch, record: RunRecord
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Times (s) and states of the events that ``watch`` found; those at the end of the run have the
+    state there, which may be more accurate than the dense output."""
+    times, states = watch.found()
+    if record.stop_state is not None:
+        for own, reached in zip(times, states):
+            reached[own == record.stop] = record.stop_state
+    return times, states
 
 
 def _pace_remedy(options: RunOptions) -> str:

@@ -532,8 +532,9 @@ def _after_actions(
     nq = mechanism.model.nq
     before = x = segment.last_state
     try:
-        # The dense output is on the closures within the tolerance only.
-        if not _closed(known, t, x):
+        # The dense output is on the closures within the tolerance only.  On a curve that turns
+        # beside a critical configuration a projection may lead to the other one there.
+        if not end.on_curve and not _closed(known, t, x):
             x = onto_closed_branch(
                 part.system if controller is None else make_system(mechanism), t, x
             )

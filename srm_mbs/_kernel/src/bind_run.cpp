@@ -353,6 +353,11 @@ struct PyRun {
         run->memory = memory;
     }
 
+    // See Run::end_at().
+    bool end_at(double t, const Array& state, double end, double time_unit, double reach) {
+        return run->end_at(t, checked_state(state), end, time_unit, reach);
+    }
+
     // Passages next to critical configurations: (time, residual, avoided, resolved).
     nb::list examined() const {
         nb::list out;
@@ -538,6 +543,7 @@ void bind_run(nb::module_& m) {
         .def("attempt_from", &PyRun::attempt_from)
         .def("go_on", &PyRun::go_on, nb::arg("end"), nb::arg("first"), nb::arg("last"),
              nb::arg("force").none(), nb::arg("forces_jump"), nb::arg("grid"), nb::arg("seconds"))
+        .def("end_at", &PyRun::end_at)
         .def("enter", [](PyRun& r) { return r.run->enter(); })
         .def("snapshot", [](const PyRun& r) { return r.run->snapshot(); })
         .def("restore", &PyRun::restore)

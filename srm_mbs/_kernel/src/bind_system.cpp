@@ -123,6 +123,15 @@ struct PySystem {
         return out;
     }
 
+    // See srm::motion_in_layer().
+    std::optional<MotionAlongCurve> motion_in_layer(double t, const Array& state, double time_unit,
+                                                    double tolerance, double reach,
+                                                    const Constants& constants) {
+        vector_of(state, state_size(), "state");
+        return srm::motion_in_layer(*system, t, to_vector(state), time_unit, tolerance, reach,
+                                    constants);
+    }
+
     // Evaluates the stage `repeats` times, to measure one evaluation in the loop.
     void repeat(double t, const Array& state, long repeats) {
         std::vector<double> rate(2 * system->nv);
@@ -642,6 +651,7 @@ void bind_system(nb::module_& m) {
              nb::arg("data"), nb::arg("controller").none())
         .def("terms", &PySystem::terms, nb::arg("t"), nb::arg("state"), nb::arg("threshold") = -1.0)
         .def("first_stage", &PySystem::first_stage)
+        .def("motion_in_layer", &PySystem::motion_in_layer)
         .def("repeat", &PySystem::repeat)
         .def("repeat_tree", &PySystem::repeat_tree)
         .def("between",

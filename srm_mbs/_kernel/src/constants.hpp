@@ -118,6 +118,7 @@ namespace srm {
     field(double, critical_frozen)         /* step up to which the Hessian is kept (units) */      \
     field(double, critical_ridge)          /* added to the Hessian's diagonal */                   \
     field(double, critical_reach)          /* of the search (units) */                             \
+    field(double, critical_farthest)       /* distance (units) from which a motion waits */        \
     field(double, critical_passed)         /* distance that is a passage, over that of the start */ \
     field(double, rounded_residual)        /* that of a singular configuration (row units) */      \
     field(double, examined_again)          /* fall of sigma after a search without a passage */    \
@@ -130,6 +131,8 @@ namespace srm {
     field(double, panel_error)             /* of interpolation (units), over rtol */               \
     field(double, relative_panel_error)    /* of interpolation, over the size of the panel */      \
     field(double, panel_shrinkage)         /* ratio of lengths that are tried */                   \
+    field(double, panel_shortened)         /* one beyond a layer, over that where it slows down */ \
+    field(double, least_energy)            /* on a panel beyond a layer, over that at its start */ \
     field(double, curvature)               /* distance of the curve's singularity (units) */       \
     field(int, passage_sweeps)                                                                     \
     field(int, bisections)                                                                         \

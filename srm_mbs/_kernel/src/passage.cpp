@@ -5,6 +5,7 @@
 #include <complex>
 #include <numeric>
 
+#include "errors.hpp"
 #include "linear.hpp"
 
 namespace srm {
@@ -253,10 +254,11 @@ public:
         double at = begun ? heading_ * std::asinh(beta / width_) : edges.front();
         motion.side = curve_.side;
         motion.begun = false;
-        for (std::size_t k = 1; k < edges.size(); ++k)
-            while (at < edges[k] && clock_ < end_) at = panel(at, edges[k]);
+        for (std::size_t k = 1; k < edges.size() && !(at < edges[k - 1]); ++k)
+            at = panels(at, edges[k]);
         if (clock_ < end_) {
-            point(-start, energy_, clock_);
+            const bool whole = !(at < edges.back());
+            point(whole ? -start : width_ * std::sinh(heading_ * at), energy_, clock_);
             if (driven_) found_.back().t = found_.back().node.time;
         }
     }
@@ -476,6 +478,23 @@ private:
             throw NoPassage{};
     }
 
+    // Goes on from `at` to the edge, of xi times the heading; returns where that led.  Beyond the
+    // layer that may be less, where the motion turns back soon.
+    double panels(double at, double edge) {
+        double target = edge;
+        while (at < edge && clock_ < end_) {
+            try {
+                at = panel(at, target);
+                target = edge;
+            } catch (const NoPassage&) {
+                target = at + constants_.panel_shortened * (target - at);
+                if (motion_.exact || at < constants_.layer) throw;
+                if (target - at < constants_.shortest_panel) break;
+            }
+        }
+        return at;
+    }
+
     // Goes on along the panel from a to b, of xi times the heading, or only to a place behind the
     // end of the passage; returns where it led.
     double panel(double a, double b) {
@@ -487,6 +506,8 @@ private:
         Vector own{0.0};
         own.insert(own.end(), x.begin(), x.end());
         own.push_back(1.0);
+        const bool beyond = !(driven_ || motion_.exact || a < constants_.layer);
+        const double least = beyond ? constants_.least_energy * energy_ : 0.0;
         const auto with_start = [](double first, const Vector& values) {
             Vector out{first};
             out.insert(out.end(), values.begin(), values.end());
@@ -496,7 +517,7 @@ private:
             for (int i = 0; i < count_; ++i) {
                 const double xi = heading_ * (a + (b - a) * x[i]), beta = width_ * std::sinh(xi);
                 const double energy = energy_ + power * (beta - start);
-                if (!(energy > 0.0)) throw NoPassage{};
+                if (!(energy > least)) throw NoPassage{};
                 double rate;
                 nodes[i] = predicted(beta, energy, rate);
                 slope[i] = width_ * std::cosh(xi) * heading_ * (b - a);
@@ -514,7 +535,7 @@ private:
             for (int i = 0; i < count_; ++i) works[i] = slope[i] * nodes[i].power;
             integrate(works, energy_, energies);
             for (double value : energies)
-                if (!(value > 0.0)) throw NoPassage{};
+                if (!(value > least)) throw NoPassage{};
             for (int i = 0; i < count_; ++i) {
                 durations[i] = slope[i] / speed(nodes[i], energies[i]);
                 if (!(durations[i] > 0.0)) throw NoPassage{};
@@ -700,6 +721,41 @@ std::vector<PassagePoint> passage_along_curve(System& system, MotionAlongCurve& 
         return Passage(closures, motion, t, state, end, rtol, collocation, constants).points();
     } catch (const NoPassage&) {
         motion.begun = false;
+        return {};
+    }
+}
+
+std::optional<MotionAlongCurve> motion_in_layer(System& system, double t,
+                                                const std::vector<double>& state, double time_unit,
+                                                double tolerance, double reach,
+                                                const Constants& constants) {
+    const int nv = system.nv;
+    UnitClosures closures(system, time_unit);
+    if (closures.n - system.structural_rank() != 1) return {};
+    try {
+        const std::vector<double> still(2 * nv, 0.0);
+        auto critical = critical_of_passage(closures, t, state.data(), still.data(), t, constants);
+        if (!critical ||
+            !(std::abs(critical->residual) > std::max(tolerance, constants.rounded_residual)))
+            return {};
+        MotionAlongCurve motion{std::move(*critical), time_unit, false};
+        const SaddleCurve curve(closures, motion, state, t, constants);
+        double along = system.driven() ? curve.along[nv] / time_unit : 0.0;
+        for (int j = 0; j < nv; ++j) along += curve.along[j] * state[system.nq + j] / closures.unit(j);
+        if (along == 0.0 || !(std::max(std::abs(curve.beta), curve.width) < reach)) return {};
+        // Of the rates as they are: rounding turns them by more than it changes their size.
+        system.evaluate(t, state.data(), System::ZoneView{});
+        std::vector<double> momentum(nv);
+        system.mass_times(&state[system.nq], momentum.data());
+        motion.energy = 0.5 * dot(&state[system.nq], momentum.data(), nv);
+        motion.begun = true;
+        motion.side = curve.side;
+        motion.beta = curve.beta;
+        motion.start = along > 0.0 ? -reach : reach;
+        return motion;
+    } catch (const NoPassage&) {
+        return {};
+    } catch (const EvaluationError&) {
         return {};
     }
 }

@@ -1,6 +1,7 @@
 // Passages of critical configurations that steps cannot make: integration/critical_passages.py.
 #pragma once
 
+#include <optional>
 #include <vector>
 
 #include "critical.hpp"
@@ -45,5 +46,13 @@ std::vector<PassagePoint> passage_along_curve(System& system, MotionAlongCurve& 
                                               const std::vector<double>& state, double end,
                                               double rtol, const Collocation& collocation,
                                               const Constants& constants);
+
+// The motion that starts at t in the layer of a critical configuration with a residual above
+// `tolerance`, to be followed up to the distance `reach` from it: layer_motion() of
+// integration/critical_passages.py.
+std::optional<MotionAlongCurve> motion_in_layer(System& system, double t,
+                                                const std::vector<double>& state, double time_unit,
+                                                double tolerance, double reach,
+                                                const Constants& constants);
 
 }  // namespace srm

@@ -55,6 +55,18 @@ void StepRecords::append(const StepResult& r, double t_new, int placement) {
     held.push_back(r.held ? 1.0 : 0.0);
 }
 
+void StepRecords::drop_last(const StepResult& r) {
+    for (auto* numbers : {&times, &ranks, &error_ratios, &placements, &stiff, &held})
+        numbers->pop_back();
+    const auto shorten = [](auto& values, std::size_t count) {
+        values.erase(values.end() - count, values.end());
+    };
+    shorten(states, r.state.size());
+    shorten(rates, r.rates.size());
+    shorten(corrections, r.correction.size());
+    shorten(sigmas, r.sigmas.size());
+}
+
 void StepRecords::clear() {
     for (auto* values : {&times, &states, &corrections, &sigmas, &ranks, &error_ratios,
                          &placements, &stiff, &held, &breaks, &break_rates})
@@ -247,7 +259,7 @@ Stop Run::attempt(StepDecision& decision) {
     if (examines_) {
         const double zero = control->next_zero();
         const bool due = !known_ && zero > t_ && memory.sigma < examine_below_;
-        if (due && (one_freedom_ || !quiet_) && examine(zero)) return make_prepared();
+        if (due && (one_freedom_ || !quiet_) && examine(zero, true)) return make_prepared();
     }
     // The end of the run, or of an interval, may be as close as that.
     const double spacing = std::nextafter(std::abs(t_), infinity) - std::abs(t_);
@@ -269,7 +281,7 @@ Stop Run::attempt(StepDecision& decision) {
     }
     if (result && examines_) {
         const std::optional<double> zero = crossing(*result);
-        if (zero && examine(*zero)) return make_prepared();
+        if (zero && examine(*zero, false)) return make_prepared();
     }
     if (result && misses_jump(proposal, *result)) return Stop::chunk;
     decision = control->decide(proposal, result);
@@ -349,9 +361,9 @@ std::optional<double> Run::crossing(const StepResult& r) const {
     return r.t + (inside ? zero : abscissae[low - r.sigmas.begin()]) * r.h;
 }
 
-// Examines the passage expected at `zero`, and prepares the steps along the curve if ordinary steps
-// are not to make it; whether there are any.
-bool Run::examine(double zero) {
+// Examines the passage at `zero`, which is expected or lies in a step, and prepares the steps along
+// the curve if ordinary steps are not to make it; whether there are any.
+bool Run::examine(double zero, bool expected) {
     const double rtol = step.norm.rtol;
     examine_below_ = constants().examined_again * memory.sigma;
     UnitClosures closures(system, zero - t_);
@@ -361,11 +373,22 @@ bool Run::examine(double zero) {
     if (!critical) return false;
     const double residual = std::abs(critical->residual);
     if (!(residual > constants().rounded_residual)) return false;
+    if (expected) {  // another one may lie between
+        std::vector<double> covered(closures.n);
+        closures.difference(critical->x, critical->t, state, t_, covered.data());
+        if (norm(covered.data(), closures.n) > constants().critical_farthest) {
+            known_ = false;
+            return false;
+        }
+    }
     const bool avoided = residual > singular_tolerance_;
     // Steps may pass a residual that is far below the tolerance, but not end beside it.
     const bool disturbs = residual > constants().disturbing * rtol;
-    if (avoided || disturbs || intervals_.ends[interval_] < zero + (zero - t_))
+    if (avoided || disturbs || intervals_.ends[interval_] < zero + (zero - t_)) {
         follow({*critical, closures.time_unit, !avoided});
+        // A motion that is still to turn back is examined again.
+        if (prepared_.empty() && one_freedom_ && expected) known_ = false;
+    }
     known_ = known_ || !prepared_.empty();
     if (known_) examined.push_back({zero, critical->residual, avoided, !prepared_.empty()});
     return !prepared_.empty();
@@ -431,6 +454,26 @@ Stop Run::make_prepared() {
         control->moved(t_);
     }
     return t_ < t_end() ? Stop::chunk : Stop::finished;
+}
+
+bool Run::end_at(double begin, const std::vector<double>& from, double end, double time_unit,
+                 double reach) {
+    auto motion = motion_in_layer(system, begin, from, time_unit, singular_tolerance_, reach,
+                                  constants());
+    if (!motion) return false;
+    std::vector<PassagePoint> points;
+    try {
+        points = passage_along_curve(system, *motion, begin, from, end, step.norm.rtol,
+                                     collocation_, constants());
+    } catch (const EvaluationError&) {
+    }
+    if (points.size() < 2) return false;
+    records.drop_last(last());
+    --made_;
+    prepared_.clear();
+    prepare(points);
+    while (!prepared_.empty()) make_prepared();
+    return true;
 }
 
 // Moves to the end t of an accepted step.

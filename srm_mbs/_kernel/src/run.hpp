@@ -91,6 +91,8 @@ struct StepRecords {
     // Makes room for the first steps, of the sizes of `result`: short runs need no more.
     void reserve(const StepResult& result);
     void append(const StepResult& result, double t_new, int placement);
+    // Removes the last step, which is `result`.
+    void drop_last(const StepResult& result);
     void clear();
 };
 
@@ -140,6 +142,11 @@ public:
     Stop go_on(double end, double first, double last, bool forces_jump, double grid,
                double seconds);
 
+    // Lets the step of a passage that was made last, from `from` at `begin`, end at `end` within it:
+    // CriticalPassages.steps_to in integration/critical_passages.py; whether it does.
+    bool end_at(double begin, const std::vector<double>& from, double end, double time_unit,
+                double reach);
+
     double t() const { return t_; }
     double last_h() const { return h_; }
     double t_end() const { return intervals_.ends.back(); }
@@ -171,7 +178,7 @@ public:
 private:
     bool leaves_closures_open(const StepResult& result);
     std::optional<double> crossing(const StepResult& result) const;
-    bool examine(double zero);
+    bool examine(double zero, bool expected);
     double late_past_layers(const StepResult& result) const;
     bool misses_jump(const Proposal& proposal, const StepResult& result);
     void follow(MotionAlongCurve motion);

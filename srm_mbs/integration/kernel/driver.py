@@ -89,7 +89,7 @@ class CompiledRecord(RunRecord):
         last, t = core.last(), core.t
         state = self.stop_state if core.count == 1 else None
         time = t if self.stop is None else self.stop
-        return EndOfSteps(self.t0, last.t, t, time, state, last.stiff)
+        return EndOfSteps(self.t0, last.t, t, time, state, last.stiff, last.critical and time == t)
 
     def _take_records(self) -> Any:
         start = (self.t0, self.x0) if self.rest is None else self.rest
@@ -202,6 +202,8 @@ def integrate(
                 dense = CompiledStepDense(run, system, start)
                 stop = events.after_step(t_start, t, state, dense)
                 if stop is not None:
+                    if stop.time < t and run.end_at(t_start, start, stop.time, system):
+                        stop = stop._replace(state=core.state)
                     record.mark_stopped(stop)
                     break
             t_start, start = t, state

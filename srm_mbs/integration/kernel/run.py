@@ -10,7 +10,7 @@ from typing import Any
 from srm_mbs._kernel import core
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System, Zone
-from srm_mbs.integration import driver, singular_endpoints
+from srm_mbs.integration import critical_passages, driver, singular_endpoints
 from srm_mbs.integration.breakpoints import BreakpointHandler, SmoothIntervals
 from srm_mbs.integration.control.step_size import StepDecision
 from srm_mbs.integration.events import step_dense
@@ -52,6 +52,51 @@ _REASONS = tuple(ReturnReason)
 """By their numbers."""
 
 
+def _time_unit(system: System, t: float) -> float:
+    """Unit of time (s) of the places of a mechanism with drives, next to ``t`` (s)."""
+    analysis = system.singularities
+    return 1.0 if analysis is None else float(analysis.geometry(analysis.q0, t).unit[-1])
+
+
+class CompiledLayerStart:
+    """:class:`~srm_mbs.integration.singular_endpoints.LayerStart` of a run of the kernel.
+
+    Parameters
+    ----------
+    kernel_system, system
+        The mechanism.
+    tolerance
+        Residual (row units) up to which a critical configuration counts as singular.
+
+    Attributes
+    ----------
+    motion
+        The ``MotionAlongCurve`` of passage.hpp that the run begins with; None without one.
+    """
+
+    def __init__(self, kernel_system: Any, system: System, tolerance: float) -> None:
+        self._kernel_system, self._system = kernel_system, system
+        self._tolerance = tolerance
+        self.motion: Any = None
+
+    @property
+    def under_way(self) -> bool:
+        """As the reference."""
+        return self.motion is not None
+
+    def begin(self, t: float, state: FloatArray) -> bool:
+        """As the reference."""
+        self.motion = self._kernel_system.motion_in_layer(
+            t,
+            state,
+            _time_unit(self._system, t),
+            self._tolerance,
+            critical_passages.START_REACH,
+            CONSTANTS,
+        )
+        return self.under_way
+
+
 def first_stage(
     evaluator: Evaluator,
     method: Method,
@@ -60,6 +105,7 @@ def first_stage(
     norm: ErrorNorm,
     t_end: float,
     stiff: bool,
+    layers: CompiledLayerStart | None,
 ) -> Any:
     """The ``IntegratorState`` of step.hpp at the start of a run: as
     :func:`~srm_mbs.integration.singular_endpoints.start`, which makes it next to a singular
@@ -71,6 +117,8 @@ def first_stage(
         The mechanism.
     stiff
         Whether the problem is stiff at the start, as far as is known.
+    layers
+        As for ``start``.
 
     Raises
     ------
@@ -83,7 +131,7 @@ def first_stage(
             return found
     except ArithmeticError:
         pass  # the reference raises the error that says why
-    memory = singular_endpoints.start(evaluator, method, t, state, norm, t_end)
+    memory = singular_endpoints.start(evaluator, method, t, state, norm, t_end, layers=layers)
     memory.stiff = stiff
     return marshalling.state_struct(memory)
 
@@ -245,6 +293,16 @@ class CompiledRun:
             placement="critical" if r.critical else "",
         )
 
+    def end_at(self, t: float, state: FloatArray, end: float, system: System) -> bool:
+        """Let the step of a passage that was made last, from ``state`` (nx,) at ``t`` (s), end at
+        ``end`` (s) within it; whether it does.  Other steps stay as they are.  ``system``: of the
+        run."""
+        if not self.core.last().critical:
+            return False
+        unit = _time_unit(system, t)
+        ended: bool = self.core.end_at(t, state, end, unit, critical_passages.SEARCH)
+        return ended
+
     def memory(self) -> IntegratorState:
         """The state of the integrator before the next step."""
         return marshalling.state_from(self.core.memory())
@@ -281,20 +339,21 @@ class CompiledRun:
         self.core.remember(marshalling.state_struct(memory))
 
     def begin(
-        self, t: float, state: FloatArray, memory: IntegratorState, first_step: float
+        self, t: float, state: FloatArray, memory: Any, first_step: float, motion: Any = None
     ) -> None:
-        """Start again, from ``state`` at ``t`` (s); the counts of steps and evaluations stay."""
+        """Start again, from ``state`` at ``t`` (s), in a layer with its ``motion``; the counts of
+        steps and evaluations stay.  ``memory``: an ``IntegratorState`` of step.hpp."""
         self.core.restore(
             core.RunSnapshot(  # type: ignore[union-attr]
                 t=t,
                 state=state,
-                memory=marshalling.state_struct(memory),
+                memory=memory,
                 control=marshalling.control_struct(h=first_step),
                 open_residual=driver.RESIDUAL_EXAMINED,
                 search_below=singular_endpoints.NEAR_SINGULAR_SIGMA,
                 known=False,
                 quiet=False,
                 examine_below=math.inf,
-                passage=None,
+                passage=motion,
             )
         )

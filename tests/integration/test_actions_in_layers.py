@@ -1,0 +1,179 @@
+"""Starts, actions of events and turns in and beside the layers of mechanisms whose branches almost
+cross.
+
+The reference has no closures: the energy integral of test_almost_singular, which gives the state
+anywhere in a layer, and the time there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import srm_mbs as srm
+from tests.integration.test_almost_singular import OFFSETS, Reference, slider_crank
+from tests.support.backends import needs_kernel, on_both
+
+T_END = 1.0
+PLACES = [-3.0, -1.5, -0.7, -0.2, 0.01, 0.4, 1.0, 2.5]
+"""Distances from the corner, over its width."""
+EXACT = {"singular_tolerance": 0.0}
+
+
+def angle_at(reference: Reference, d: float, place: float) -> float:
+    """The monotone angle at a ``place`` beside its first corner."""
+    return float(reference.sign * (0.5 * np.pi + place * np.sqrt(abs(d))))
+
+
+def state_at(reference: Reference, angle: float) -> tuple[Any, Any]:
+    """Exact q and v at the monotone ``angle``."""
+    mass, potential, rates = reference.terms(np.array(angle))
+    speed = reference.sign * np.sqrt(2.0 * (reference.energy - float(potential)) / float(mass))
+    other = -np.arcsin(reference.short / reference.long * np.sin(angle))
+    theta, psi = (angle, other) if reference.by_crank else (other, angle)
+    dtheta, dpsi = (speed * float(rate) for rate in rates)
+    return np.array([theta, psi - theta]), np.array([dtheta, dpsi - dtheta])
+
+
+def check_start(d: float, rtol: float, place: float, backend: str) -> None:
+    mechanism, reference = slider_crank(d), Reference(d)
+    angle = angle_at(reference, d, place)
+    q, v = state_at(reference, angle)
+    options: dict[str, Any] = {"t0": reference.time(angle), "q0": q, "v0": v, **EXACT}
+    solution = srm.simulate(mechanism, T_END, rtol=rtol, backend=backend, **options)
+    assert solution.success, solution.message
+    assert reference.error(solution) < 10.0 * rtol + 5e-10
+
+
+@on_both
+@pytest.mark.parametrize(
+    ("d", "rtol", "place"),
+    [(-1e-6, 1e-10, 0.4), (1e-8, 1e-9, 0.01), (1e-10, 1e-6, -0.2), (-1e-12, 1e-6, 1.0)],
+)
+def test_a_start_in_a_layer_follows_its_curve(
+    d: float, rtol: float, place: float, backend: str
+) -> None:
+    check_start(d, rtol, place, backend)
+
+
+@pytest.mark.stress
+@needs_kernel
+@pytest.mark.parametrize("d", OFFSETS)
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
+def test_starts_anywhere_in_layers_of_any_width_follow_their_curve(d: float, rtol: float) -> None:
+    for place in PLACES:
+        check_start(d, rtol, place, "kernel")
+
+
+def at_time(when: float, action: Any = None, terminal: bool = False) -> srm.Event:
+    return srm.Event(lambda t, q, v: t - when, direction=1, action=action, terminal=terminal)
+
+
+def time_at(d: float, place: float) -> float:
+    reference = Reference(d)
+    return reference.time(angle_at(reference, d, place))
+
+
+def check_action(d: float, rtol: float, place: float, backend: str) -> None:
+    """An action that changes nothing changes nothing."""
+    mechanism, reference = slider_crank(d), Reference(d)
+    seen: list[Any] = []
+    event = at_time(time_at(d, place), lambda t, q, v: seen.append((t, q, v)))
+    solution = srm.simulate(mechanism, T_END, rtol=rtol, events=event, backend=backend, **EXACT)
+    assert solution.success, solution.message
+    assert len(seen) == 1
+    # The place in a layer is known to rounding over its width.
+    assert max(reference.errors(*seen[0])) < 100.0 * rtol + 5e-7
+    assert reference.error(solution) < 10.0 * rtol + 5e-10
+
+
+@on_both
+@pytest.mark.parametrize(
+    ("d", "rtol", "place"),
+    [(-1e-2, 1e-6, 0.4), (-1e-6, 1e-8, 0.0), (1e-10, 1e-6, -0.7), (-1e-12, 1e-9, 2.5)],
+)
+def test_an_action_in_a_layer_finds_the_motion_on_its_curve(
+    d: float, rtol: float, place: float, backend: str
+) -> None:
+    check_action(d, rtol, place, backend)
+
+
+@pytest.mark.stress
+@needs_kernel
+@pytest.mark.parametrize("d", OFFSETS)
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
+def test_actions_anywhere_in_layers_of_any_width_change_nothing(d: float, rtol: float) -> None:
+    for place in PLACES:
+        check_action(d, rtol, place, "kernel")
+
+
+@on_both
+@pytest.mark.parametrize(("d", "place"), [(-1e-5, 0.1), (1e-9, -0.5), (-1e-11, 1.0)])
+def test_an_action_that_reverses_the_motion_in_a_layer_leads_back(
+    d: float, place: float, backend: str
+) -> None:
+    mechanism, when = slider_crank(d), time_at(d, place)
+    event = at_time(when, lambda t, q, v: (q, -v))
+    solution = srm.simulate(
+        mechanism, 2.0 * when, rtol=1e-9, events=event, backend=backend, **EXACT
+    )
+    np.testing.assert_allclose(solution.q[-1], mechanism.q0, atol=1e-8)
+    np.testing.assert_allclose(solution.v[-1], -mechanism.v0, atol=1e-7)
+
+
+@on_both
+def test_the_end_at_an_event_in_a_layer_is_one_state_everywhere(
+    backend: str, tmp_path: Path
+) -> None:
+    mechanism, when = slider_crank(-1e-6), time_at(-1e-6, -0.2)
+    options: dict[str, Any] = {"rtol": 1e-6, "backend": backend, **EXACT}
+    event = at_time(when, terminal=True)
+    solution = srm.simulate(mechanism, T_END, events=event, **options)
+    assert solution.status == "event"
+    end = np.concatenate([solution.q[-1], solution.v[-1]])
+    saved = tmp_path / "run.npz"
+    solution.save(saved)
+    loaded = srm.load_solution(saved)
+    for state in (
+        np.concatenate(solution(solution.t[-1])),
+        np.concatenate([solution.q_events[0][-1], solution.v_events[0][-1]]),
+        np.concatenate([loaded.q[-1], loaded.v[-1]]),
+    ):
+        np.testing.assert_array_equal(state, end)
+    went_on = srm.simulate(mechanism, T_END, t0=solution.t[-1], q0=end[:2], v0=end[2:], **options)
+    assert Reference(-1e-6).error(went_on) < 1e-5
+
+
+@on_both
+def test_a_simulator_may_be_set_into_a_layer(backend: str) -> None:
+    d, place = -1e-9, 0.3
+    reference = Reference(d)
+    angle = angle_at(reference, d, place)
+    simulator = srm.Simulator(slider_crank(d), rtol=1e-8, backend=backend, **EXACT)
+    simulator.reset(*state_at(reference, angle), t=reference.time(angle))
+    for _ in range(20):
+        simulator.step(1e-2)
+    assert max(reference.errors(simulator.t, simulator.q, simulator.v)) < 1e-5
+
+
+@on_both
+@pytest.mark.parametrize(
+    ("d", "stiffness"), [(1e-9, 110.0), (4e-11, 110.0), (4e-8, 114.0), (1e-6, 114.0)]
+)
+def test_a_motion_that_turns_back_soon_beyond_a_layer_returns_through_it(
+    d: float, stiffness: float, backend: str
+) -> None:
+    """A spring turns it 0.01 to 0.04 rad beyond; it comes to its start with reversed rates."""
+    ideal = slider_crank(d)
+    spring = srm.TorsionSpring("crank", stiffness=stiffness, rest_angle=0.3)
+    mechanism = replace(ideal, forces=(spring,))
+    back = srm.Event(lambda t, q, v: q[0] - ideal.q0[0], direction=-1, terminal=True)
+    solution = srm.simulate(mechanism, 3.0, rtol=1e-9, events=back, backend=backend, **EXACT)
+    assert solution.status == "event", solution.message
+    assert [passage.kind for passage in solution.crossings] == ["avoided", "avoided"]
+    np.testing.assert_allclose(solution.q[-1], mechanism.q0, atol=1e-9)
+    np.testing.assert_allclose(solution.v[-1], -mechanism.v0, atol=1e-8)

@@ -236,6 +236,10 @@ class CartesianPendulum:
         """No limit."""
         return np.inf
 
+    def rescale(self, t: float, state: FloatArray) -> bool:
+        """False: there is nothing that sizes are relative to."""
+        return False
+
     def begin_step(self, t: float, state: FloatArray) -> None:
         """Nothing jumps."""
 

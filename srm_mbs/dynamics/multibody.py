@@ -331,6 +331,10 @@ class Mechanics(Manifold):
         """See :class:`~srm_mbs.dynamics.system.System`."""
         self._bushings = {}
 
+    def rescale(self, t: float, state: FloatArray) -> bool:
+        """False: the sizes are those of the mechanism."""
+        return False
+
     def begin_step(self, t: float, state: FloatArray) -> None:
         """See :class:`~srm_mbs.dynamics.system.System`."""
         if self._forces is not None and self._forces.bushings:

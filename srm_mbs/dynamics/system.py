@@ -276,6 +276,10 @@ class System(Protocol):
     def step_limit(self, state: FloatArray) -> float:
         """Largest step for which the chart stays well inside its domain (s)."""
 
+    def rescale(self, t: float, state: FloatArray) -> bool:
+        """Adapt sizes to which sigma is relative to ``state`` at ``t`` (s), from where a step
+        begins; whether they changed, so that the first stage is to be evaluated again."""
+
     def begin_step(self, t: float, state: FloatArray) -> None:
         """Begin a step from ``state`` at ``t`` (s): forces that jump somewhere go on smoothly up
         to its end."""

@@ -422,6 +422,8 @@ def integrate(
                 if not pass_critical(None):
                     memory = restarted()
                 continue
+            if system.rescale(t, x):
+                memory = restarted()
             limit = min(max_step, system.step_limit(x), jump.limit, rest_limit)
             proposal = control.propose(t, limit, memory)
             if proposal.singular_arrival and breakpoints is not None:

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.dae import JACOBIAN_REMEDY, DaeSystem
+from srm_mbs.dynamics.dae import JACOBIAN_REMEDY, TIME_DERIVATIVE_REMEDY, DaeSystem
 from srm_mbs.errors import (
     CallbackError,
     ControllerError,
@@ -161,7 +161,7 @@ def run_dae(
     raise_at_first_call(record.error, t0)
     if record.status is RunStatus.INTERRUPTED:
         record.add_pace(options.t_end, PACE_REMEDY)
-    _check_jacobian(system, record)
+    _check_derivatives(system, record)
     turned = suspected(wrappers)
     if first_sweeps:
         _add_sweep_failure(system, options, record, first_sweeps, turned)
@@ -211,8 +211,8 @@ def _integrate(
             raise InputError(
                 f"G B is singular at the start, or almost (sigma = {memory.sigma:.1e})",
                 element="x0",
-                remedy="Start beside that point, or, where states are small, give an atol below "
-                f"rtol times their size ({options.rtol * float(np.abs(state).max()):.1g})",
+                remedy="Start beside that point, or, where states are small or of different sizes, "
+                "give an atol of rtol times the usual size of each",
             )
         first_sweeps = sweep_nodes(memory)
         record, wrappers = integrate_steps(system, options, norm, memory, state, watch, words=DAE)
@@ -221,21 +221,22 @@ def _integrate(
     return record, wrappers, first_sweeps
 
 
-def _check_jacobian(system: DaeSystem, record: RunRecord) -> None:
-    """Mark and explain in the record that G is not dg/dx where the run ended: at the start, where
-    it is checked too, a wrong one may have the values of the right one."""
+def _check_derivatives(system: DaeSystem, record: RunRecord) -> None:
+    """Mark and explain in the record that G or g_t is not the derivative of g where the run ended:
+    at the start, where they are checked too, wrong ones may have the values of the right ones."""
     if not record.times:
         return
-    t = record.times[-1]
+    t, x = record.times[-1], record.last_state
     try:
-        wrong = system.wrong_jacobian(t, record.last_state)
+        wrong, remedy = system.wrong_jacobian(t, x), JACOBIAN_REMEDY
+        if wrong is None:
+            wrong = system.wrong_time_derivative(t, x, t - record.t0, (-1, 1))
+            remedy = TIME_DERIVATIVE_REMEDY
     except (CallbackError, EvaluationError):
         return
     if wrong is not None:
         record.status = RunStatus.FAILED
-        record.message = (
-            f"The results are wrong: at t = {time_text(t)} s, {wrong}. {JACOBIAN_REMEDY}."
-        )
+        record.message = f"The results are wrong: at t = {time_text(t)} s, {wrong}. {remedy}."
 
 
 def _add_sweep_failure(

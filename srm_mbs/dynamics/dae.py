@@ -82,7 +82,7 @@ class ObliqueProjection:
         self.factorisations = 0
 
     def factor(self, G: FloatArray, B: FloatArray, threshold: float | None) -> None:
-        """Factorise G (ny, nx) and B (nx, ny).
+        """Factorise G (ny, nx) and B (nx, ny), which are finite.
 
         ``threshold`` drops the directions in which G or B is below ``threshold`` times its
         reference (the zone); ``None`` uses all.
@@ -90,11 +90,9 @@ class ObliqueProjection:
         Raises
         ------
         EvaluationError
-            If G or B is not finite, or G B is singular though neither G nor B loses rank.
+            If G B is singular though neither G nor B loses rank.
         """
         self.factorisations += 1
-        if not (np.isfinite(G).all() and np.isfinite(B).all()):
-            raise EvaluationError("G or B is not finite")
         packed, order, tau, pivots = pivoted_qr((G * self.scale / self.rows[:, None]).T)
         packed_b, _, tau_b, pivots_b = pivoted_qr(B / self.scale[:, None] / self.columns)
         g_sizes, b_sizes = _sizes(packed, pivots), _sizes(packed_b, pivots_b)
@@ -106,13 +104,17 @@ class ObliqueProjection:
         self.R = packed[:rank, :rank]
         self.Q_G = q_columns(packed, tau, rank)
         self.Q_B = q_columns(packed_b, tau_b, rank)
-        left, cosines, right = np.linalg.svd(self.Q_G.T @ self.Q_B)
-        cosine = float(cosines[-1]) if rank else 1.0
+        angles = self.Q_G.T @ self.Q_B
+        if rank == 1:
+            cosine = abs(float(angles[0, 0]))
+        else:
+            left, cosines, right = np.linalg.svd(angles)
+            cosine = float(cosines[-1]) if rank else 1.0
         if cosine < PIVOT_ZERO:
             raise EvaluationError(
                 "G B is singular though neither G nor B loses rank: x' does not stay bounded there"
             )
-        self.inverse: FloatArray = (right.T / cosines) @ left.T
+        self.inverse: FloatArray = 1.0 / angles if rank == 1 else (right.T / cosines) @ left.T
         self.sizes = np.array([g_sizes[-1], b_sizes[-1], cosine])
         self.sigma = float((self.sizes / self.reference).min())
 

@@ -190,6 +190,7 @@ class CartesianPendulum:
     """
 
     has_constraints = True
+    time_unit = " s"
     singularities = None
     branch_system = None
     carries_yhat = False

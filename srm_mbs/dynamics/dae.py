@@ -331,6 +331,7 @@ class DaeSystem:
     """
 
     has_constraints = True
+    time_unit = ""
     sigma_scatters = False
     time_dependent = True
     laws = np.zeros(0)

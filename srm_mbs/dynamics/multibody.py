@@ -235,6 +235,7 @@ class Mechanics(Manifold):
 
     carries_yhat = True
     predicts = True
+    time_unit = " s"
     sigma_scatters = False
     residual_scale = np.zeros(0)
     """Factor (m,) from each scaled row in use to row units."""

@@ -184,6 +184,8 @@ class System(Protocol):
     """Whether sweeps carry yhat, which the zone replaces next to a singular configuration."""
     predicts: bool
     """Whether the exact multiplier is known: False for a DAE whose g_t is needed and not given."""
+    time_unit: str
+    """Unit of times in messages after a space, " s"; empty for a DAE, whose t may be anything."""
     sigma_scatters: bool
     """Whether sigma jumps when other pivots are taken, along the graph of many loops."""
 

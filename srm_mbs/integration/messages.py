@@ -105,7 +105,7 @@ def stiffness_sentence(
     )
 
 
-def branch_changes(times: Sequence[float], what: str, remedy: str) -> str:
+def branch_changes(times: Sequence[float], what: str, remedy: str, unit: str = " s") -> str:
     """A sentence naming the times at which the motion may have changed its branch.
 
     Parameters
@@ -116,6 +116,8 @@ def branch_changes(times: Sequence[float], what: str, remedy: str) -> str:
         What happened there: "the velocity turned".
     remedy
         A sentence.
+    unit
+        Of the times.
     """
     if not times:
         return ""
@@ -123,6 +125,6 @@ def branch_changes(times: Sequence[float], what: str, remedy: str) -> str:
         ", ..." if len(times) > TIMES_LISTED else ""
     )
     return (
-        f" Next to singular configurations, up to t = {listed} s, {what} and no shorter step "
-        f"mended it: the motion may have changed its branch. {remedy}"
+        f" Next to singular configurations, up to t = {listed}{unit}, {what} and no shorter "
+        f"step mended it: the motion may have changed its branch. {remedy}"
     )

@@ -155,7 +155,7 @@ def run_dae(
     log_start("DAE", options, norm, "python")
     watch = None
     if options.events is not None:
-        prepared = prepare_events(options.events, lambda event: event)
+        prepared = prepare_events(options.events, lambda event: event, unit="")
         watch = EventWatch(method.scheme, prepared, state.size)
     record, wrappers, first_sweeps = _integrate(system, options, norm, state, watch)
     raise_at_first_call(record.error, t0)
@@ -166,7 +166,7 @@ def run_dae(
     if first_sweeps:
         _add_sweep_failure(system, options, record, first_sweeps, turned)
     else:
-        record.message += branch_changes(turned, "x' turned", TURN_REMEDY)
+        record.message += branch_changes(turned, "x' turned", TURN_REMEDY, "")
     data = record.data(method.scheme, system.tangent_size)
     result = result_type(
         system,
@@ -236,7 +236,7 @@ def _check_derivatives(system: DaeSystem, record: RunRecord) -> None:
         return
     if wrong is not None:
         record.status = RunStatus.FAILED
-        record.message = f"The results are wrong: at t = {time_text(t)} s, {wrong}. {remedy}."
+        record.message = f"The results are wrong: at t = {time_text(t)}, {wrong}. {remedy}."
 
 
 def _add_sweep_failure(

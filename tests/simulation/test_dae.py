@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from benchmarks.thesis.entries import PRINTED
@@ -792,3 +794,93 @@ def test_a_sigma_that_jumps_with_its_pivots_does_not_stop_the_run(seed: int) -> 
     assert run.success, run.message
     assert run.stats.steps < 60
     assert np.abs(run.x[-1] - at(4.0)).max() < 1e-3
+
+
+def test_messages_give_no_unit_to_the_independent_variable() -> None:
+    def half(t: float, x: np.ndarray) -> float:
+        return t - 0.5
+
+    half.terminal = True  # type: ignore[attr-defined]
+    whole = srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO)
+    assert whole.message == "The run reached t = 1."
+    ended = srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO, events=half)
+    assert ended.message == "The event 'half' ended the run at t = 0.5."
+    broken = srm.solve_dae(problem_two(f=late(np.full(2, np.nan))), (0.0, 1.0), START_TWO)
+    assert broken.message.startswith("Stopped at t = 0.5 with step ")
+    assert re.search(r"\bs\b", broken.message) is None
+    with pytest.raises(srm.InputError, match=r"the run covers t = 0 to 1, asked for are 2 to 2\."):
+        whole(2.0)
+
+
+def stiff_circle(rate: float) -> srm.SemiExplicitDAE:
+    """x = (cos s, sin s), s = sin t, to which the angle decays with ``rate``."""
+
+    def f(t: float, x: np.ndarray) -> np.ndarray:
+        speed = np.cos(t) - rate * (np.arctan2(x[1], x[0]) - np.sin(t))
+        return speed * np.array([-x[1], x[0]]) + np.cos(t) * x
+
+    return srm.SemiExplicitDAE(
+        f=f, B=lambda t, x: x, g=lambda t, x: 0.5 * (x @ x - 1.0), G=lambda t, x: x
+    )
+
+
+@pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
+@pytest.mark.parametrize(("rate", "steps"), [(1e1, 40), (1e3, 120), (1e5, 350)])
+def test_a_stiff_motion_along_a_curved_constraint_keeps_its_tolerance(
+    rate: float, steps: int, tableau: str
+) -> None:
+    """The stiff direction turns with it, so that steps grow like the fourth root of the rate."""
+    run = srm.solve_dae(stiff_circle(rate), (0.0, 3.0), [1.0, 0.0], rtol=1e-5, tableau=tableau)
+    assert run.success, run.message
+    angle = np.sin(run.t)
+    assert np.abs(run.x - np.array([np.cos(angle), np.sin(angle)]).T).max() < 2e-5
+    assert run.y[1:-1, 0] == pytest.approx(np.cos(run.t[1:-1]), abs=1e-9)
+    assert run.stats.steps < steps
+
+
+@pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
+def test_robertsons_kinetics_with_the_sum_as_a_constraint(tableau: str) -> None:
+    """Compared with Radau on the equations without a constraint, at a tighter tolerance."""
+
+    def kinetics(t: float, x: np.ndarray) -> np.ndarray:
+        first, second, third = 0.04 * x[0], 1e4 * x[1] * x[2], 3e7 * x[1] ** 2
+        return np.array([second - first, first - second - third, third])
+
+    problem = srm.SemiExplicitDAE(
+        f=lambda t, x: kinetics(t, x) * [1.0, 1.0, 0.0],
+        B=lambda t, x: np.array([0.0, 0.0, 1.0]),
+        g=lambda t, x: x.sum() - 1.0,
+        G=lambda t, x: np.ones(3),
+    )
+    start, end = [1.0, 0.0, 0.0], 1e4
+    run = srm.solve_dae(problem, (0.0, end), start, atol=[1e-8, 1e-12, 1e-8], tableau=tableau)
+    assert run.success, run.message
+    assert run.stats.steps < 300
+    exact = solve_ivp(kinetics, (0.0, end), start, method="Radau", rtol=1e-10, atol=1e-15).y[:, -1]
+    assert run.x[-1] / exact == pytest.approx(1.0, abs=2e-6)
+    assert run.y[-1, 0] == pytest.approx(-kinetics(end, exact)[2], rel=1e-4)
+
+
+@pytest.mark.parametrize("rate", [1e3, 1e6])
+@pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
+def test_a_stiff_motion_passes_a_singular_point(tableau: str, rate: float) -> None:
+    """x_2 decays to x_0, with ``rate``, nonlinearly."""
+    inner = passing_singularity()
+
+    def f(t: float, x: np.ndarray) -> np.ndarray:
+        off = x[2] - x[0]
+        with np.errstate(over="ignore", invalid="ignore"):  # of explicit steps that are too long
+            decay = rate * (off + 0.3 * off**2)
+            return np.append(inner.f(t, x), 1.0 / (1.0 + x[0] ** 2) - decay)
+
+    problem = srm.SemiExplicitDAE(
+        f=f,
+        B=lambda t, x: np.append(inner.B(t, x), 0.0),
+        g=lambda t, x: inner.g(t, x),
+        G=lambda t, x: np.append(inner.G(t, x), 0.0),
+    )
+    run = srm.solve_dae(problem, (0.0, 3.0), [*START_PASSING, START_PASSING[0]], tableau=tableau)
+    assert run.success, run.message
+    exact = solution_passing(3.0)
+    assert run.x[-1] == pytest.approx([*exact, exact[0]], abs=1e-5)
+    assert run.stats.steps < 300

@@ -675,6 +675,10 @@ def test_a_circle_that_shrinks_is_no_singular_point(tableau: str) -> None:
     assert run.x[-1] * np.exp(20.0) == pytest.approx([np.cos(20.0), np.sin(20.0)], abs=1e-4)
     assert run.y[:, 0] == pytest.approx(1.0, abs=1e-9)
     assert run(1.0)[1] == pytest.approx(1.0, abs=1e-5)
+    assert "G B is almost singular" not in run.message
+    wide = srm.solve_dae(problem, (0.0, 20.0), [1.0, 0.0], tableau=tableau, rtol=1e-9)
+    assert "times the tolerance in x only" in wide.message
+    assert "give an atol of rtol times their size there" in wide.message
 
 
 @pytest.mark.parametrize("start", [-1.0, 0.0])
@@ -884,3 +888,19 @@ def test_a_stiff_motion_passes_a_singular_point(tableau: str, rate: float) -> No
     exact = solution_passing(3.0)
     assert run.x[-1] == pytest.approx([*exact, exact[0]], abs=1e-5)
     assert run.stats.steps < 300
+
+
+@pytest.mark.parametrize("tableau", ["dop853", "dopr54"])
+def test_a_stiff_run_says_so(tableau: str) -> None:
+    """And where explicit steps were asked for, what to do about it."""
+    runs = {
+        name: srm.solve_dae(stiff_circle(1e3), (0.0, 1.0), [1.0, 0.0], rtol=1e-4, tableau=name)
+        for name in (tableau, "auto")
+    }
+    assert f"the stability of {tableau} limits its steps" in runs[tableau].message
+    assert "Stiff, with steps of rodas5p: t = 0." in runs["auto"].message
+    assert runs["auto"].settings.stiff
+    assert runs["auto"].stats.steps < runs[tableau].stats.steps
+    usual = srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO, tableau=tableau)
+    assert usual.message == "The run reached t = 1."
+    assert usual.settings.stiff == ()

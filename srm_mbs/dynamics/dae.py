@@ -384,8 +384,11 @@ class DaeSystem:
     # --- the user's functions -----------------------------------------------------------------
 
     def _accepted(self, name: str) -> tuple[tuple[int, ...], ...]:
-        """Shapes that ``name`` may return: the one of the contract, shorter where ny = 1."""
+        """Shapes that ``name`` may return: the one of the contract, shorter where ny = 1, and for a
+        single value that of a number."""
         shape = self.shapes[name]
+        if max(shape) == 1:
+            return (shape, (1,), ())
         if self.ny > 1 or name == "f":
             return (shape,)
         return (shape, ()) if len(shape) == 1 else (shape, (self.nx,))

@@ -904,3 +904,17 @@ def test_a_stiff_run_says_so(tableau: str) -> None:
     usual = srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO, tableau=tableau)
     assert usual.message == "The run reached t = 1."
     assert usual.settings.stiff == ()
+
+
+def test_functions_of_one_state_may_return_numbers() -> None:
+    problem = srm.SemiExplicitDAE(
+        f=lambda t, x: -x[0],
+        B=lambda t, x: 1.0,
+        g=lambda t, x: x[0] - np.sin(t),
+        G=lambda t, x: 1.0,
+        g_t=lambda t, x: -np.cos(t),
+    )
+    run = srm.solve_dae(problem, (0.0, 1.0), [0.0])
+    assert run.success, run.message
+    assert run.x[:, 0] == pytest.approx(np.sin(run.t), abs=1e-14)
+    assert run.y[:, 0] == pytest.approx(-np.sin(run.t) - np.cos(run.t), abs=1e-13)

@@ -228,6 +228,8 @@ DIFFERENCE = 1e-6
 FINER = tuple(10.0**-k for k in range(9))
 """Lengths of that step, over the usual one, until the differences settle: x may be of a smaller
 size than its unit, and g vary faster than the run is long."""
+SIDES = ((1, -1), (1, 0), (0, -1))
+"""Ends of the differences, in steps: at a kink a derivative is that on one of its sides."""
 SETTLED = 0.1
 """They have where their change is that much smaller than their distance from what is given."""
 JACOBIAN_REMEDY = "Return the derivative of g with respect to x from G"
@@ -250,10 +252,6 @@ def _differs(given: FloatArray, slope: FloatArray, least: FloatArray) -> NDArray
         least, np.abs(slope)
     )
     return wrong
-
-
-SIDES = ((1, -1), (1, 0), (0, -1))
-"""Ends of the differences, in steps: at a kink a derivative is that on one of its sides."""
 
 
 def _other_slope(

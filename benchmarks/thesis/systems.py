@@ -190,6 +190,7 @@ class CartesianPendulum:
     """
 
     has_constraints = True
+    time_unit = " s"
     singularities = None
     branch_system = None
     carries_yhat = False
@@ -235,6 +236,10 @@ class CartesianPendulum:
     def step_limit(self, state: FloatArray) -> float:
         """No limit."""
         return np.inf
+
+    def rescale(self, t: float, state: FloatArray) -> bool:
+        """False: there is nothing that sizes are relative to."""
+        return False
 
     def begin_step(self, t: float, state: FloatArray) -> None:
         """Nothing jumps."""

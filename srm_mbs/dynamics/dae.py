@@ -8,7 +8,8 @@ G^T = Q_G R_G and B = Q_B R_B, and C = Q_G^T Q_B,
     E r = Q_B C^-1 R_G^-T r,    P w = Q_B C^-1 Q_G^T w,
 
 so that the division is by the cosines of the angles in C only, where rows of G, or columns of B,
-become dependent: P stays bounded there (thesis, (2.4)), unlike products with (GB)^-1.
+become dependent: P stays bounded there (thesis, (2.4)), unlike products with (GB)^-1.  Angles and
+sizes are those in z = x/s with scales s, where the states of a problem have the same size.
 
 :class:`DaeTerms` has the quantities of one evaluated point.  One sweep of the SRM is
 y_s = y_{s-1} + T g/eps, x_s' = f - B y_s, (2.2) of the thesis with T = I or (GB)^T; and for
@@ -50,8 +51,10 @@ class ObliqueProjection:
 
     Parameters
     ----------
+    scale : (nx,)
+        Scales s of the states: G s and B/s are factorised.
     rows : (ny,), columns : (ny,)
-        Typical norms of the rows of G and the columns of B.
+        Typical norms of the rows of G s and the columns of B/s.
     reference
         Three typical ``sizes``; 1 if not known.
 
@@ -69,13 +72,17 @@ class ObliqueProjection:
     """
 
     def __init__(
-        self, rows: FloatArray, columns: FloatArray, reference: Sequence[float] = (1.0, 1.0, 1.0)
+        self,
+        scale: FloatArray,
+        rows: FloatArray,
+        columns: FloatArray,
+        reference: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> None:
-        self.rows, self.columns, self.reference = rows, columns, reference
+        self.scale, self.rows, self.columns, self.reference = scale, rows, columns, reference
         self.factorisations = 0
 
     def factor(self, G: FloatArray, B: FloatArray, threshold: float | None) -> None:
-        """Factorise G (ny, nx) and B (nx, ny).
+        """Factorise G (ny, nx) and B (nx, ny), which are finite.
 
         ``threshold`` drops the directions in which G or B is below ``threshold`` times its
         reference (the zone); ``None`` uses all.
@@ -83,13 +90,11 @@ class ObliqueProjection:
         Raises
         ------
         EvaluationError
-            If G or B is not finite, or G B is singular though neither G nor B loses rank.
+            If G B is singular though neither G nor B loses rank.
         """
         self.factorisations += 1
-        if not (np.isfinite(G).all() and np.isfinite(B).all()):
-            raise EvaluationError("G or B is not finite")
-        packed, order, tau, pivots = pivoted_qr((G / self.rows[:, None]).T)
-        packed_b, _, tau_b, pivots_b = pivoted_qr(B / self.columns)
+        packed, order, tau, pivots = pivoted_qr((G * self.scale / self.rows[:, None]).T)
+        packed_b, _, tau_b, pivots_b = pivoted_qr(B / self.scale[:, None] / self.columns)
         g_sizes, b_sizes = _sizes(packed, pivots), _sizes(packed_b, pivots_b)
         floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold)
         used = (g_sizes > floor * self.reference[0]) & (b_sizes > floor * self.reference[1])
@@ -99,13 +104,17 @@ class ObliqueProjection:
         self.R = packed[:rank, :rank]
         self.Q_G = q_columns(packed, tau, rank)
         self.Q_B = q_columns(packed_b, tau_b, rank)
-        left, cosines, right = np.linalg.svd(self.Q_G.T @ self.Q_B)
-        cosine = float(cosines[-1]) if rank else 1.0
+        angles = self.Q_G.T @ self.Q_B
+        if rank == 1:
+            cosine = abs(float(angles[0, 0]))
+        else:
+            left, cosines, right = np.linalg.svd(angles)
+            cosine = float(cosines[-1]) if rank else 1.0
         if cosine < PIVOT_ZERO:
             raise EvaluationError(
                 "G B is singular though neither G nor B loses rank: x' does not stay bounded there"
             )
-        self.inverse: FloatArray = (right.T / cosines) @ left.T
+        self.inverse: FloatArray = 1.0 / angles if rank == 1 else (right.T / cosines) @ left.T
         self.sizes = np.array([g_sizes[-1], b_sizes[-1], cosine])
         self.sigma = float((self.sizes / self.reference).min())
 
@@ -114,11 +123,11 @@ class ObliqueProjection:
         if self.rank == 0:
             return np.zeros(self.Q_B.shape[0])
         scaled = (residual / self.rows)[self.order]
-        return self.Q_B @ (self.inverse @ whiten(self.R, scaled))
+        return self.scale * (self.Q_B @ (self.inverse @ whiten(self.R, scaled)))
 
     def project(self, w: FloatArray) -> FloatArray:
         """P w (nx,)."""
-        return self.Q_B @ (self.inverse @ (self.Q_G.T @ w))
+        return self.scale * (self.Q_B @ (self.inverse @ (self.Q_G.T @ (w / self.scale))))
 
 
 class DaeTerms:
@@ -208,16 +217,33 @@ PROBES = 24
 """Points around the start at which the typical sizes of G and B are measured."""
 PROBE_DISTANCE = 0.1
 """Their distance, in the units of the states."""
+OTHER_SIZE = 10.0
+"""Factor by which the largest unit of the states changes until they are measured again."""
+DEPENDENT = 1e-10
+"""Smallest singular value of rows that count as independent."""
+DEPENDENT_SHARE = 0.01
+"""Smallest factor in their relation, of a norm of 1, of those that a message names."""
 DIFFERENCE = 1e-6
 """Step of the finite differences that check G and g_t, relative to max(1, |x|) and to the run."""
 FINER = tuple(10.0**-k for k in range(9))
 """Lengths of that step, over the usual one, until the differences settle: x may be of a smaller
 size than its unit, and g vary faster than the run is long."""
+SIDES = ((1, -1), (1, 0), (0, -1))
+"""Ends of the differences, in steps: at a kink a derivative is that on one of its sides."""
 SETTLED = 0.1
 """They have where their change is that much smaller than their distance from what is given."""
 JACOBIAN_REMEDY = "Return the derivative of g with respect to x from G"
+TIME_DERIVATIVE_REMEDY = "Return the partial derivative of g with respect to t from g_t"
 WRONG_DERIVATIVE = 1e-3
 """Relative difference from which a derivative is called wrong."""
+
+
+def _dependent(rows: FloatArray) -> list[int]:
+    """Numbers of the ``rows`` (ny, nx) of norms of about 1 that depend on each other."""
+    left, sizes, _ = np.linalg.svd(rows)
+    shares = np.abs(left[:, sizes < DEPENDENT]).max(axis=1, initial=0.0)
+    numbers: list[int] = np.flatnonzero(shares > DEPENDENT_SHARE).tolist()
+    return numbers
 
 
 def _differs(given: FloatArray, slope: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
@@ -229,10 +255,25 @@ def _differs(given: FloatArray, slope: FloatArray, least: FloatArray) -> NDArray
 
 
 def _other_slope(
+    slope_over: Callable[[float, tuple[int, int]], FloatArray],
+    given: FloatArray,
+    least: FloatArray,
+    differences: Sequence[tuple[int, int]] = SIDES,
+) -> FloatArray | None:
+    """Where differences settle, if none of them does at the ``given`` derivatives; None also where
+    the function ends, and there is nothing to compare with."""
+    others = []
+    for ends in differences:
+        others.append(_settled(lambda finer: slope_over(finer, ends), given, least))  # noqa: B023
+        if others[-1] is None:
+            return None
+    return others[0]
+
+
+def _settled(
     slope_over: Callable[[float], FloatArray], given: FloatArray, least: FloatArray
 ) -> FloatArray | None:
-    """Where differences settle, if that is not at the ``given`` derivatives; None also where the
-    function ends, and there is nothing to compare with."""
+    """Where differences of one kind settle; see :func:`_other_slope`."""
     last: FloatArray | None = None
     for finer in FINER:
         try:
@@ -252,15 +293,16 @@ def _other_slope(
     return last
 
 
-def _units(x0: FloatArray, one: FloatArray) -> FloatArray:
-    """Sizes (nx,) of the states: |x0|, or what the tolerance is absolute to, ``one``, between 1 and
-    the largest state; 1 at the origin, where the states tell nothing.
+def _units(x: FloatArray, one: FloatArray, greatest: float) -> FloatArray:
+    """Sizes (nx,) of the states: |x|, or what the tolerance is absolute to, ``one``, between 1 and
+    the largest state, now or since the start (``greatest``); 1 at the origin, where the states
+    tell nothing.
 
     A circle of a radius far below them counts as a point next to a singular one.
     """
-    largest = float(np.abs(x0).max()) or 1.0
-    least = np.clip(one, min(1.0, largest), max(1.0, largest))
-    return np.maximum(np.abs(x0), least).astype(np.float64, copy=False)
+    largest = float(np.abs(x).max()) or 1.0
+    least = np.clip(one, min(1.0, largest), max(1.0, greatest))
+    return np.maximum(np.abs(x), least).astype(np.float64, copy=False)
 
 
 class DaeSystem:
@@ -287,6 +329,7 @@ class DaeSystem:
     """
 
     has_constraints = True
+    time_unit = ""
     sigma_scatters = False
     time_dependent = True
     laws = np.zeros(0)
@@ -306,7 +349,11 @@ class DaeSystem:
         self.T = T
         self.evaluations = 0
         self.nx = len(x0)
-        self._unit = _units(x0, one)
+        # Powers of 2, by which nothing is rounded; 1 if atol is the same for all states.
+        self._scale = np.exp2(np.round(np.log2(one / one.max())))
+        self._one = one / self._scale
+        self._greatest = float(np.abs(x0 / self._scale).max())
+        self._unit = _units(x0 / self._scale, self._one, self._greatest)
         self.ny = self._count_rows(t0, x0)
         self.shapes = {
             "f": (self.nx,),
@@ -335,8 +382,11 @@ class DaeSystem:
     # --- the user's functions -----------------------------------------------------------------
 
     def _accepted(self, name: str) -> tuple[tuple[int, ...], ...]:
-        """Shapes that ``name`` may return: the one of the contract, shorter where ny = 1."""
+        """Shapes that ``name`` may return: the one of the contract, shorter where ny = 1, and for a
+        single value that of a number."""
         shape = self.shapes[name]
+        if max(shape) == 1:
+            return (shape, (1,), ())
         if self.ny > 1 or name == "f":
             return (shape,)
         return (shape, ()) if len(shape) == 1 else (shape, (self.nx,))
@@ -407,14 +457,18 @@ class DaeSystem:
         rng = np.random.default_rng(0)
         pairs = [(self.call("G", t, x), self.call("B", t, x))]
         for _ in range(PROBES):
-            probe = x + PROBE_DISTANCE * self._unit * rng.uniform(-1.0, 1.0, self.nx)
+            moves = self._scale * self._unit * rng.uniform(-1.0, 1.0, self.nx)
+            probe = x + PROBE_DISTANCE * moves
             try:
                 with np.errstate(all="ignore"):
                     pairs.append((self.call("G", t, probe), self.call("B", t, probe)))
             except (CallbackError, EvaluationError):
                 continue  # outside the domain of the functions; the start itself counts
-        rows = np.sqrt(np.mean([np.sum(G**2, axis=1) for G, _ in pairs], axis=0))
-        columns = np.sqrt(np.mean([np.sum(B**2, axis=0) for _, B in pairs], axis=0))
+        scale = self._scale
+        rows = np.sqrt(np.mean([np.sum((G * scale) ** 2, axis=1) for G, _ in pairs], axis=0))
+        columns = np.sqrt(
+            np.mean([np.sum((B / scale[:, None]) ** 2, axis=0) for _, B in pairs], axis=0)
+        )
         for name, sizes, what in (("G", rows, "row"), ("B", columns, "column")):
             if not (sizes > 0.0).all():
                 raise InputError(
@@ -422,7 +476,7 @@ class DaeSystem:
                     element=name,
                     remedy="Give equations of index 2: G B regular",
                 )
-        measured = ObliqueProjection(rows, columns)
+        measured = ObliqueProjection(scale, rows, columns)
         sizes_seen = []
         for G, B in pairs:
             try:
@@ -432,12 +486,46 @@ class DaeSystem:
             if not measured.rank_deficient:
                 sizes_seen.append(measured.sizes)
         if 2 * len(sizes_seen) < len(pairs):
+            G, B = pairs[-1]
+            for name, matrix, what, remedy in (
+                ("G", G * scale / rows[:, None], "rows", "Leave out what follows from other rows"),
+                ("B", (B / scale[:, None] / columns).T, "columns", "Give equations of index 2"),
+            ):
+                dependent = _dependent(matrix)
+                if dependent:
+                    raise InputError(
+                        f"{what} {', '.join(map(str, dependent))} of {name} depend on each other "
+                        "at the start and around it",
+                        element=name,
+                        remedy=remedy,
+                    )
             raise InputError(
                 "G B is singular at the start and around it",
                 element="G",
                 remedy="Give equations of index 2: G B regular but for isolated points",
             )
-        return ObliqueProjection(rows, columns, np.median(sizes_seen, axis=0).tolist())
+        return ObliqueProjection(scale, rows, columns, np.median(sizes_seen, axis=0).tolist())
+
+    def rescale(self, t: float, state: FloatArray) -> bool:
+        """Measure G and B again where the states have another size than before; see
+        :class:`~srm_mbs.dynamics.system.System`.
+
+        A solution that decays would come next to a singular point by its old size.
+        """
+        scaled, old = state / self._scale, self._unit
+        self._greatest = max(self._greatest, float(np.abs(scaled).max()))
+        unit = _units(scaled, self._one, self._greatest)
+        if not scaled.any() or 1.0 / OTHER_SIZE < unit.max() / old.max() < OTHER_SIZE:
+            return False
+        self._unit = unit
+        try:
+            measured = self._measured(t, state)
+        except (CallbackError, EvaluationError, InputError):
+            self._unit = old
+            return False
+        measured.factorisations += self.projection.factorisations
+        self.projection = measured
+        return True
 
     def wrong_jacobian(self, t: float, x: FloatArray) -> str | None:
         """Says where G at ``t`` and x (nx,) is not dg/dx; None if it is.
@@ -450,20 +538,46 @@ class DaeSystem:
         G = self.call("G", t, x)
         for i in range(self.nx):
 
-            def slope_over(finer: float, i: int = i) -> FloatArray:
+            def slope_over(finer: float, sides: tuple[int, int], i: int = i) -> FloatArray:
                 step = np.zeros(self.nx)
                 step[i] = finer * DIFFERENCE * max(1.0, abs(x[i]))
-                ahead, behind = self.call("g", t, x + step), self.call("g", t, x - step)
-                return np.asarray((ahead - behind) / (2.0 * step[i]))
+                ahead, behind = (self.call("g", t, x + side * step) for side in sides)
+                return np.asarray((ahead - behind) / ((sides[0] - sides[1]) * step[i]))
 
-            slope = _other_slope(slope_over, G[:, i], self.projection.rows)
+            least = self.projection.rows / self._scale[i]
+            slope = _other_slope(slope_over, G[:, i], least)
             if slope is not None:
-                row = int(np.argmax(_differs(G[:, i], slope, self.projection.rows)))
+                row = int(np.argmax(_differs(G[:, i], slope, least)))
                 return (
                     f"G[{row}, {i}] is {G[row, i]:.6g}, but dg/dx is {slope[row]:.6g} by finite "
                     "differences"
                 )
         return None
+
+    def wrong_time_derivative(
+        self, t: float, x: FloatArray, span: float, sides: Sequence[int] = (1,)
+    ) -> str | None:
+        """Says that g_t at ``t`` and x (nx,) is not dg/dt on any of the ``sides``; None if it is.
+
+        Raises
+        ------
+        CallbackError, EvaluationError
+            If g_t cannot be evaluated.
+        """
+        if self.problem.g_t is None:
+            return None
+
+        def slope_over(finer: float, ends: tuple[int, int]) -> FloatArray:
+            dt = ends[0] * finer * DIFFERENCE * span
+            g0, g1, g2 = (self.call("g", t + k * dt, x) for k in range(3))
+            return np.asarray((4.0 * g1 - 3.0 * g0 - g2) / (2.0 * dt))
+
+        given = self.call("g_t", t, x)
+        least = self.projection.rows * self._unit.max() / span
+        slope = _other_slope(slope_over, given, least, [(side, 0) for side in sides])
+        if slope is None:
+            return None
+        return f"g_t is {given}, but dg/dt is {slope} by finite differences"
 
     def _time_derivative_known(self, t0: float, x: FloatArray, t_end: float) -> bool:
         """Whether g_t is given, or g does not depend on t."""
@@ -479,20 +593,9 @@ class DaeSystem:
                 if (np.abs(moved) > 1e-12 * scale).any():
                     return False
             return True
-
-        def slope_over(finer: float) -> FloatArray:
-            dt = finer * DIFFERENCE * span
-            g0, g1, g2 = (self.call("g", t0 + k * dt, x) for k in range(3))
-            return np.asarray((4.0 * g1 - 3.0 * g0 - g2) / (2.0 * dt))
-
-        given = self.call("g_t", t0, x)
-        slope = _other_slope(slope_over, given, self.projection.rows * self._unit.max() / span)
-        if slope is not None:
-            raise InputError(
-                f"g_t = {given} at the start, but dg/dt there is {slope} by finite differences",
-                element="g_t",
-                remedy="Return the partial derivative of g with respect to t from g_t",
-            )
+        wrong = self.wrong_time_derivative(t0, x, span)
+        if wrong is not None:
+            raise InputError(f"at the start, {wrong}", element="g_t", remedy=TIME_DERIVATIVE_REMEDY)
         return True
 
     # --- the contract -------------------------------------------------------------------------
@@ -545,7 +648,7 @@ class DaeSystem:
 
     def position_norm(self, delta: FloatArray) -> float:
         """max |dx| over the units; see :class:`~srm_mbs.dynamics.system.System`."""
-        return float((np.abs(delta) / self._unit).max())
+        return float((np.abs(delta) / (self._scale * self._unit)).max())
 
     def reachable(self, start: FloatArray, end: FloatArray) -> bool:
         """True: there is one chart."""
@@ -565,7 +668,7 @@ class DaeSystem:
         """max |g| over the typical row of G and the size of x: a relative error of x."""
         g = self.call("g", t, state)
         return float(np.max(np.abs(g) / self.projection.rows)) / max(
-            min(1.0, float(self._unit.max())), float(np.abs(state).max())
+            min(1.0, float(self._unit.max())), float(np.abs(state / self._scale).max())
         )
 
     def damping(self, t: float, state: FloatArray) -> NDArray[np.complex128]:
@@ -582,7 +685,8 @@ class DaeSystem:
         return np.inf
 
     def begin_step(self, t: float, state: FloatArray) -> None:
-        """Nothing jumps."""
+        """Measure by the size of ``state``."""
+        self.rescale(t, state)
 
     def end_step(self) -> None:
         """Nothing jumps."""
@@ -599,6 +703,7 @@ class DaeSystem:
 
     def multiplier_at(self, t: float, state: FloatArray) -> FloatArray:
         """y (ny,) by the exact prediction; of least norm where B loses rank."""
+        self.rescale(t, state)
         terms = self.evaluate(t, state)
         return self.factor_of(terms.multiplier(), terms.B)
 

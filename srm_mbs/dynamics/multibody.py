@@ -235,6 +235,7 @@ class Mechanics(Manifold):
 
     carries_yhat = True
     predicts = True
+    time_unit = " s"
     sigma_scatters = False
     residual_scale = np.zeros(0)
     """Factor (m,) from each scaled row in use to row units."""
@@ -330,6 +331,10 @@ class Mechanics(Manifold):
     def end_step(self) -> None:
         """See :class:`~srm_mbs.dynamics.system.System`."""
         self._bushings = {}
+
+    def rescale(self, t: float, state: FloatArray) -> bool:
+        """False: the sizes are those of the mechanism."""
+        return False
 
     def begin_step(self, t: float, state: FloatArray) -> None:
         """See :class:`~srm_mbs.dynamics.system.System`."""

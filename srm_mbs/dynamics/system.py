@@ -184,6 +184,8 @@ class System(Protocol):
     """Whether sweeps carry yhat, which the zone replaces next to a singular configuration."""
     predicts: bool
     """Whether the exact multiplier is known: False for a DAE whose g_t is needed and not given."""
+    time_unit: str
+    """Unit of times in messages after a space, " s"; empty for a DAE, whose t may be anything."""
     sigma_scatters: bool
     """Whether sigma jumps when other pivots are taken, along the graph of many loops."""
 
@@ -275,6 +277,10 @@ class System(Protocol):
 
     def step_limit(self, state: FloatArray) -> float:
         """Largest step for which the chart stays well inside its domain (s)."""
+
+    def rescale(self, t: float, state: FloatArray) -> bool:
+        """Adapt sizes to which sigma is relative to ``state`` at ``t`` (s), from where a step
+        begins; whether they changed, so that the first stage is to be evaluated again."""
 
     def begin_step(self, t: float, state: FloatArray) -> None:
         """Begin a step from ``state`` at ``t`` (s): forces that jump somewhere go on smoothly up

@@ -71,7 +71,7 @@ def checked_output_times(t: Any, *, scalar: bool = False) -> FloatArray:
         times = np.array(t, dtype=float)
     except Exception:  # objects may raise anything
         raise InputError(
-            f"t = {safe_repr(t)} does not consist of numbers", element="t", remedy="Give times (s)"
+            f"t = {safe_repr(t)} does not consist of numbers", element="t", remedy="Give times"
         ) from None
     if times.ndim != 1 and not (scalar and times.ndim == 0):
         kinds = "a scalar or a vector of times" if scalar else "a vector of times"
@@ -79,8 +79,8 @@ def checked_output_times(t: Any, *, scalar: bool = False) -> FloatArray:
     return times
 
 
-def check_within(t: FloatArray, start: float, end: float) -> None:
-    """Refuse times ``t`` (k,) outside a run from ``start`` to ``end`` (s).
+def check_within(t: FloatArray, start: float, end: float, unit: str = " s") -> None:
+    """Refuse times ``t`` (k,) outside a run from ``start`` to ``end`` (s), of that ``unit``.
 
     Raises
     ------
@@ -90,8 +90,8 @@ def check_within(t: FloatArray, start: float, end: float) -> None:
     tolerance = TIME_TOLERANCE * max(abs(start), abs(end))
     if len(t) and not (np.min(t) >= start - tolerance and np.max(t) <= end + tolerance):
         raise InputError(
-            f"the run covers t = {start:.9g} to {end:.9g} s, "
-            f"asked for are {np.min(t):.9g} to {np.max(t):.9g} s",
+            f"the run covers t = {start:.9g} to {end:.9g}{unit}, "
+            f"asked for are {np.min(t):.9g} to {np.max(t):.9g}{unit}",
             element="t",
             remedy="Give times of the run",
         )
@@ -536,7 +536,8 @@ class DenseOutput:
                 if not self.file:
                     raise
                 raise InputError(
-                    f"the run cannot be read in the step from t = {times[step]:.9g} s: {error}",
+                    f"the run cannot be read in the step from t = {times[step]:.9g}"
+                    f"{self._system.time_unit}: {error}",
                     file=self.file,
                     remedy="Run the simulation again: the numbers in the file disagree",
                 ) from error
@@ -557,7 +558,8 @@ class DenseOutput:
 
     def check(self, t: FloatArray) -> None:
         """Raise InputError if a time of ``t`` (k,) lies outside the run."""
-        check_within(t, float(self._steps.times[0]), self._steps.end)
+        times, unit = self._steps.times, self._system.time_unit
+        check_within(t, float(times[0]), self._steps.end, unit)
 
     def nodes(self) -> tuple[FloatArray, FloatArray]:
         """Times (n + 1,) and states (n + 1, nx) at the ends of the steps, the start first; the

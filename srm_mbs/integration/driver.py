@@ -135,6 +135,8 @@ class RunRecord:
         Of a failed run, what led to it, as far as it is known.
     error
         The exception that ended it, with its traceback; None without one.
+    time_unit
+        That of the :class:`~srm_mbs.dynamics.system.System`.
     stop, stop_state
         Time (s) and state (nx,) where a terminal event ended the run, within the last step; None
         without one.
@@ -153,6 +155,7 @@ class RunRecord:
 
     t0: float
     x0: FloatArray
+    time_unit: str = field(default=" s", kw_only=True)
     steps: list[StepResult] = field(default_factory=list, init=False)
     times: list[float] = field(default_factory=list, init=False)
     attempts: list[Attempt] = field(default_factory=list, init=False)
@@ -177,7 +180,7 @@ class RunRecord:
     def mark_finished(self, t_end: float) -> None:
         """Mark it as complete."""
         self.status = RunStatus.FINISHED
-        self.message = f"The run reached t = {time_text(t_end)} s."
+        self.message = f"The run reached t = {time_text(t_end)}{self.time_unit}."
 
     def mark_stopped(self, stop: Stop) -> None:
         """Mark it as ended by a terminal event."""
@@ -186,15 +189,14 @@ class RunRecord:
 
     def mark_aborted(self, t: float, error: BaseException) -> None:
         """Mark it as interrupted, or failed because a function of the user raised, at ``t``."""
+        at = f"{time_text(t)}{self.time_unit}"
         if isinstance(error, KeyboardInterrupt):
             self.status = RunStatus.INTERRUPTED
-            self.message = f"Interrupted at t = {time_text(t)} s; everything up to there is kept."
+            self.message = f"Interrupted at t = {at}; everything up to there is kept."
         else:
             self.status = RunStatus.FAILED
             self.error = error
-            self.message = (
-                f"Stopped at t = {time_text(t)} s: {error}. Everything up to there is kept."
-            )
+            self.message = f"Stopped at t = {at}: {error}. Everything up to there is kept."
 
     def add_pace(self, t_end: float, remedy: str) -> None:
         """Say in the message of an interrupted run to ``t_end`` (s) how many steps remain, with the
@@ -203,7 +205,8 @@ class RunRecord:
         h = end.last_time - end.last_start
         if h > 0.0:
             left = (t_end - end.last_time) / h
-            self.message += f" The last step was {h:.1e} s long; {left:.1e} such steps remain."
+            length = f"{h:.1e}{self.time_unit}"
+            self.message += f" The last step was {length} long; {left:.1e} such steps remain."
             self.message += f" {remedy}" if left > MANY_STEPS else ""
 
     def mark_failed(
@@ -246,13 +249,14 @@ class RunRecord:
             f"Try a smaller {'rtol' if adaptive else 'step'}, another tableau, or check that "
             f"{words.check}"
         )
-        stopped = f" with step {h:.1e} s: {failure.sentence}"
+        step = f"step {h:.1e}{self.time_unit}"
+        stopped = f" with {step}: {failure.sentence}"
         if self.cause is not None:
             remedy = self.cause.remedy
-            stopped = f": {self.cause.clause}. With step {h:.1e} s, {failure.sentence}"
+            stopped = f": {self.cause.clause}. With {step}, {failure.sentence}"
         return (
-            f"Stopped at t = {time_text(t)} s{stopped}.{near} Everything up to there is kept. "
-            f"{remedy}."
+            f"Stopped at t = {time_text(t)}{self.time_unit}{stopped}.{near} Everything up to there "
+            f"is kept. {remedy}."
         )
 
     @property
@@ -357,7 +361,7 @@ def integrate(
         With status ``finished``, or ``event`` after a terminal event; or ``failed`` or
         ``interrupted`` (Ctrl-C), with everything computed so far.
     """
-    record = RunRecord(t0, state.copy())
+    record = RunRecord(t0, state.copy(), time_unit=system.time_unit)
     started = time.perf_counter()
     closures = Closures(system, norm)
     t, x = t0, state
@@ -392,7 +396,7 @@ def integrate(
             record.mark_stopped(stop)
             return True
         if tick is not None:
-            call_progress(tick, t, result.h, x)
+            call_progress(tick, t, result.h, x, system.time_unit)
         return False
 
     def pass_critical(zero: float | None, expected: bool) -> bool:
@@ -431,6 +435,8 @@ def integrate(
                 if not pass_critical(None, False):
                     memory = restarted()
                 continue
+            if system.rescale(t, x):
+                memory = restarted()
             limit = min(max_step, system.step_limit(x), jump.limit, rest_limit)
             proposal = control.propose(t, limit, memory)
             if proposal.singular_arrival and breakpoints is not None:
@@ -524,26 +530,28 @@ def _no_further_step(
     if record.made >= WATCHED_STEPS and record.made % WATCHED_STEPS == 0:
         covered = t - record.watched_time
         if covered < STANDSTILL * (t_end - record.t0):
-            return standstill(covered, words)
+            return standstill(covered, words, record.time_unit)
     return None
 
 
-def standstill(covered: float, words: ProblemVocabulary = MECHANISM) -> RunFailure:
+def standstill(
+    covered: float, words: ProblemVocabulary = MECHANISM, unit: str = " s"
+) -> RunFailure:
     """The failure of a run whose last WATCHED_STEPS steps covered only ``covered`` (s)."""
     return RunFailure(
         StopReason.STANDSTILL,
-        f"the last {WATCHED_STEPS} steps covered only {covered:.1e} s; {words.forces} changes too "
-        "fast or is not smooth",
+        f"the last {WATCHED_STEPS} steps covered only {covered:.1e}{unit}; {words.forces} changes "
+        "too fast or is not smooth",
     )
 
 
-def call_progress(tick: Tick, t: float, h: float, x: FloatArray) -> None:
+def call_progress(tick: Tick, t: float, h: float, x: FloatArray, unit: str = " s") -> None:
     """Call ``tick`` with a copy of ``x``; an exception of it does not lose the run."""
     try:
         tick(t, h, x.copy())
     except Exception as error:
         raise ControllerError(
-            f"the progress callback raised {safe_repr(error)} at t = {time_text(t)} s"
+            f"the progress callback raised {safe_repr(error)} at t = {time_text(t)}{unit}"
         ) from error
 
 

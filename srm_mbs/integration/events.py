@@ -131,6 +131,8 @@ class EventFunction:
         Time (s) after the start of the run up to which a zero lies on it; None for
         :func:`same_time` of the first step.  In a segment of a run 0 for zeros that its predecessor
         did not count.
+    time_unit
+        Of times in messages, after a space.
     """
 
     name: str
@@ -143,6 +145,7 @@ class EventFunction:
     rests: Callable[[float, FloatArray], float] | None = None
     floor: float = 0.0
     start_tolerance: float | None = None
+    time_unit: str = " s"
 
     def __call__(self, t: float, state: FloatArray) -> float:
         """The value at ``t``; ``state`` must not be needed any more, the user may write to it.
@@ -175,17 +178,16 @@ class EventFunction:
         if value.size != 1 or not np.isfinite(value).all():
             given = None if found is None else value.tolist()
             raise EventError(
-                f"the event {self.name} returned {given} at t = {time_text(t)} s; "
-                "it must return one finite number",
+                f"the event {self.name} returned {given} at t = {time_text(t)}"
+                f"{self.time_unit}; it must return one finite number",
                 t,
             )
         return float(value.item())
 
     def fail(self, error: Exception, t: float) -> NoReturn:
         """Raise the EventError of a function that raised ``error`` at ``t`` (s)."""
-        raise EventError(
-            f"the event {self.name} raised {safe_repr(error)} at t = {time_text(t)} s", t
-        ) from error
+        at = f"t = {time_text(t)}{self.time_unit}"
+        raise EventError(f"the event {self.name} raised {safe_repr(error)} at {at}", t) from error
 
     def floor_at(self, t: float, state: FloatArray) -> float:
         """Size of values that count as zero at ``t`` (s) and ``state``."""
@@ -197,7 +199,7 @@ class EventFunction:
 
 
 def prepare_events(
-    events: Any, adapt: Callable[[Callable[..., Any]], StateFunction]
+    events: Any, adapt: Callable[[Callable[..., Any]], StateFunction], unit: str = " s"
 ) -> list[EventFunction]:
     """The event functions of a run, from a callable of the user or a list of them.
 
@@ -208,16 +210,21 @@ def prepare_events(
         :class:`EventFunction`, whose function is one of (t, state) already, is left as it is.
     adapt
         Makes a function of (t, state) of each callable.
+    unit
+        Of times in messages, after a space.
 
     Raises
     ------
     InputError
         If something cannot be called, or an attribute has no meaning.
     """
-    return [
+    functions = [
         event if isinstance(event, EventFunction) else _event_function(event, i, adapt)
         for i, event in enumerate(listed_events(events))
     ]
+    for function in functions:
+        function.time_unit = unit
+    return functions
 
 
 def _event_function(
@@ -295,10 +302,10 @@ class Occurrence(NamedTuple):
     state: FloatArray
 
 
-def stop_message(name: str, count: int, t: float) -> str:
+def stop_message(name: str, count: int, t: float, unit: str = " s") -> str:
     """The message of a run that the occurrence ``count`` of the event ``name`` ended at ``t``."""
     which = f" (occurrence {count})" if count > 1 else ""
-    return f"The event {name}{which} ended the run at t = {t:.9g} s."
+    return f"The event {name}{which} ended the run at t = {t:.9g}{unit}."
 
 
 class Stop(NamedTuple):
@@ -449,7 +456,7 @@ class EventWatch:
             self._states[i].append(state)
             event, count = self._events[i], len(self._times[i])
             if stop is None and (event.acts or count >= event.occurrences):
-                stop = Stop(time, state, stop_message(event.name, count, time))
+                stop = Stop(time, state, stop_message(event.name, count, time, event.time_unit))
         return stop
 
     def found(self) -> tuple[list[FloatArray], list[FloatArray]]:

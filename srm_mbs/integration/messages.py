@@ -78,7 +78,10 @@ DAE = ProblemVocabulary(
 
 
 def stiffness_sentence(
-    intervals: Sequence[tuple[float, float]], scheme: ButcherTableau, adaptive: bool
+    intervals: Sequence[tuple[float, float]],
+    scheme: ButcherTableau,
+    adaptive: bool,
+    unit: str = " s",
 ) -> str:
     """A sentence about where a run was found to be stiff; empty where it was not.
 
@@ -90,22 +93,24 @@ def stiffness_sentence(
         The tableau of the run.
     adaptive
         Whether steps follow a tolerance.
+    unit
+        Of the times.
     """
     if not intervals or not adaptive:
         return ""
     listed = ", ".join(
-        f"{time_text(start)} to {time_text(end)} s" for start, end in intervals[:TIMES_LISTED]
+        f"{time_text(start)} to {time_text(end)}{unit}" for start, end in intervals[:TIMES_LISTED]
     )
     more = ", ..." if len(intervals) > TIMES_LISTED else ""
     if scheme.stiff is not None:
         return f" Stiff, with steps of {scheme.stiff.name}: t = {listed}{more}."
     return (
-        f" The run is stiff from t = {time_text(intervals[0][0])} s on: the stability of "
+        f" The run is stiff from t = {time_text(intervals[0][0])}{unit} on: the stability of "
         f'{scheme.name} limits its steps, not their accuracy. Use tableau="auto" or "rodas5p".'
     )
 
 
-def branch_changes(times: Sequence[float], what: str, remedy: str) -> str:
+def branch_changes(times: Sequence[float], what: str, remedy: str, unit: str = " s") -> str:
     """A sentence naming the times at which the motion may have changed its branch.
 
     Parameters
@@ -116,6 +121,8 @@ def branch_changes(times: Sequence[float], what: str, remedy: str) -> str:
         What happened there: "the velocity turned".
     remedy
         A sentence.
+    unit
+        Of the times.
     """
     if not times:
         return ""
@@ -123,6 +130,6 @@ def branch_changes(times: Sequence[float], what: str, remedy: str) -> str:
         ", ..." if len(times) > TIMES_LISTED else ""
     )
     return (
-        f" Next to singular configurations, up to t = {listed} s, {what} and no shorter step "
-        f"mended it: the motion may have changed its branch. {remedy}"
+        f" Next to singular configurations, up to t = {listed}{unit}, {what} and no shorter "
+        f"step mended it: the motion may have changed its branch. {remedy}"
     )

@@ -22,7 +22,7 @@ class SemiExplicitDAE:
     Parameters
     ----------
     f
-        (t, x) -> (nx,).
+        (t, x) -> (nx,), or a number for nx = 1, as of B and G.
     B
         (t, x) -> (nx, ny), or (nx,) for ny = 1.
     g

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.dae import JACOBIAN_REMEDY, DaeSystem
+from srm_mbs.dynamics.dae import JACOBIAN_REMEDY, TIME_DERIVATIVE_REMEDY, DaeSystem
 from srm_mbs.errors import (
     CallbackError,
     ControllerError,
@@ -21,8 +21,10 @@ from srm_mbs.integration.control.prescribed_times import suspected
 from srm_mbs.integration.control.step_size import ControlWrapper
 from srm_mbs.integration.driver import RunRecord, RunStatus
 from srm_mbs.integration.events import EventWatch, prepare_events
-from srm_mbs.integration.messages import DAE, branch_changes
+from srm_mbs.integration.messages import DAE, branch_changes, stiffness_sentence
 from srm_mbs.integration.methods.base import ErrorNorm, Method, method_messages
+from srm_mbs.integration.methods.near_singular import WATCHED_SIGMA
+from srm_mbs.integration.methods.psrm import is_split
 from srm_mbs.integration.methods.thesis.dae_stability import instability
 from srm_mbs.integration.methods.thesis.sweep import SweepNode, carried_multipliers, sweep_nodes
 from srm_mbs.model.dae import SemiExplicitDAE
@@ -50,6 +52,8 @@ Result = TypeVar("Result", bound=DaeResult)
 
 CONSISTENT = 1e-8
 """Largest constraint error of an accepted start, as a relative error of x0."""
+DECAY_REMEDY = "If it is the states that are small, give an atol of rtol times their size there."
+"""What to do where states have become so small that they seem next to a singular point."""
 PACE_REMEDY = "A larger rtol, or a right-hand side that changes less abruptly, allows longer ones."
 """What may shorten a run that was interrupted."""
 TURN_REMEDY = (
@@ -155,19 +159,23 @@ def run_dae(
     log_start("DAE", options, norm, "python")
     watch = None
     if options.events is not None:
-        prepared = prepare_events(options.events, lambda event: event)
+        prepared = prepare_events(options.events, lambda event: event, unit="")
         watch = EventWatch(method.scheme, prepared, state.size)
     record, wrappers, first_sweeps = _integrate(system, options, norm, state, watch)
     raise_at_first_call(record.error, t0)
+    adaptive = options.step is None
     if record.status is RunStatus.INTERRUPTED:
         record.add_pace(options.t_end, PACE_REMEDY)
-    _check_jacobian(system, record)
+    _check_derivatives(system, record)
+    if adaptive and is_split(method):
+        _check_end(system, record, norm)
     turned = suspected(wrappers)
     if first_sweeps:
         _add_sweep_failure(system, options, record, first_sweeps, turned)
     else:
-        record.message += branch_changes(turned, "x' turned", TURN_REMEDY)
+        record.message += branch_changes(turned, "x' turned", TURN_REMEDY, "")
     data = record.data(method.scheme, system.tangent_size)
+    stiff = data.stiff_intervals
     result = result_type(
         system,
         method,
@@ -175,10 +183,12 @@ def run_dae(
         carried_multipliers(first_sweeps, record.steps),
         t_eval=options.t_eval,
         attempts=attempt_array(record.attempts),
-        settings=settings(options, norm, False, "python"),
+        settings=settings(options, norm, False, "python", stiff),
         events=None if watch is None else watch.found(),
         status=record.status,
-        message=record.message + method_messages(method, record.steps, norm),
+        message=record.message
+        + method_messages(method, record.steps, norm)
+        + stiffness_sentence(stiff, method.scheme, adaptive, ""),
         stats=statistics(
             record,
             data.count,
@@ -211,8 +221,8 @@ def _integrate(
             raise InputError(
                 f"G B is singular at the start, or almost (sigma = {memory.sigma:.1e})",
                 element="x0",
-                remedy="Start beside that point, or, where states are small, give an atol below "
-                f"rtol times their size ({options.rtol * float(np.abs(state).max()):.1g})",
+                remedy="Start beside that point, or, where states are small or of different sizes, "
+                "give an atol of rtol times the usual size of each",
             )
         first_sweeps = sweep_nodes(memory)
         record, wrappers = integrate_steps(system, options, norm, memory, state, watch, words=DAE)
@@ -221,20 +231,39 @@ def _integrate(
     return record, wrappers, first_sweeps
 
 
-def _check_jacobian(system: DaeSystem, record: RunRecord) -> None:
-    """Mark and explain in the record that G is not dg/dx where the run ended: at the start, where
-    it is checked too, a wrong one may have the values of the right one."""
+def _check_derivatives(system: DaeSystem, record: RunRecord) -> None:
+    """Mark and explain in the record that G or g_t is not the derivative of g where the run ended:
+    at the start, where they are checked too, wrong ones may have the values of the right ones."""
     if not record.times:
         return
-    t = record.times[-1]
+    t, x = record.times[-1], record.last_state
     try:
-        wrong = system.wrong_jacobian(t, record.last_state)
+        wrong, remedy = system.wrong_jacobian(t, x), JACOBIAN_REMEDY
+        if wrong is None:
+            wrong = system.wrong_time_derivative(t, x, t - record.t0, (-1, 1))
+            remedy = TIME_DERIVATIVE_REMEDY
     except (CallbackError, EvaluationError):
         return
     if wrong is not None:
         record.status = RunStatus.FAILED
-        record.message = (
-            f"The results are wrong: at t = {time_text(t)} s, {wrong}. {JACOBIAN_REMEDY}."
+        record.message = f"The results are wrong: at t = {time_text(t)}, {wrong}. {remedy}."
+
+
+def _check_end(system: DaeSystem, record: RunRecord, norm: ErrorNorm) -> None:
+    """Say in the record that the run ended so close to a singular point that g, which holds to
+    rounding, leaves x open by more than the tolerance."""
+    if not record.steps or record.steps[-1].sigmas[-1] > WATCHED_SIGMA:
+        return
+    t, x = record.times[-1], record.last_state
+    try:
+        terms = system.evaluate(t, x)
+        off = norm(terms.correction(), norm.weights(system.state_scale(x)))
+    except (CallbackError, EvaluationError):
+        return
+    if off > 1.0:
+        record.message += (
+            f" At t = {time_text(t)}, where G B is almost singular (sigma = {terms.sigma:.1e}), "
+            f"the constraints hold to {off:.1g} times the tolerance in x only. {DECAY_REMEDY}"
         )
 
 

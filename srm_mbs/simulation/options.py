@@ -138,7 +138,7 @@ class RunOptions(NamedTuple):
             t0=t0,
             t_end=t_end,
             placement=checked_placement(self.placement),
-            singular_times=checked_singular_times(self.singular_times, t0, t_end),
+            singular_times=checked_singular_times(self.singular_times, t0, t_end, unit),
             step=step,
             first_step=first_step,
             max_step=max_step,
@@ -146,7 +146,7 @@ class RunOptions(NamedTuple):
             tableau=None,
             rtol=checked_rtol(self.rtol, loosest, tightest),
             singular_tolerance=checked_singular_tolerance(self.singular_tolerance),
-            t_eval=checked_times(self.t_eval, t0, t_end),
+            t_eval=checked_times(self.t_eval, t0, t_end, unit),
         )
 
     @property
@@ -314,11 +314,12 @@ def checked_method(method: str | Method, tableau: str | ButcherTableau | None) -
     return method
 
 
-def checked_times(t_eval: Any, t0: float, t_end: float) -> FloatArray | None:
+def checked_times(t_eval: Any, t0: float, t_end: float, unit: str) -> FloatArray | None:
     """Output times within the run, increasing; None if none are given."""
     if t_eval is None:
         return None
-    remedy = f"Give increasing times between {t0:.15g} and t_end = {t_end:.15g} s"
+    remedy = f"Give increasing times between {t0:.15g} and t_end = {t_end:.15g}"
+    remedy += " s" if unit else ""
     times = numbers(t_eval, "t_eval", remedy)
     slack = 1e-12 * max(abs(t0), abs(t_end))  # np.arange(4) * 0.1 ends a rounding error after 0.3
     if times.ndim != 1 or (
@@ -347,17 +348,18 @@ def _given_times(values: Any, what: str, remedy: str) -> FloatArray:
     return times
 
 
-def checked_singular_times(singular_times: Any, t0: float, t_end: float) -> FloatArray:
+def checked_singular_times(singular_times: Any, t0: float, t_end: float, unit: str) -> FloatArray:
     """The given times within the run, in order."""
     if isinstance(singular_times, tuple) and not singular_times:
         return np.zeros(0)
-    remedy = "Give times (s) between the start and the end of the run"
+    seconds = " (s)" if unit else ""
+    remedy = f"Give times{seconds} between the start and the end of the run"
     times = np.unique(_given_times(singular_times, "singular_times", remedy))
     slack = AVOIDABLE * (t_end - t0)
     for end in (t0, t_end):
         if np.any(np.abs(times - end) <= slack):
             raise InputError(
-                f"the run starts or ends at {end:.15g} s, where a step must begin or end",
+                f"the run starts or ends at t = {end:.15g}, where a step must begin or end",
                 element="singular_times",
                 remedy=remedy,
             )

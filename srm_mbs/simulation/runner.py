@@ -807,7 +807,7 @@ def chosen_first_step(
 
 def failed_start(t0: float, state: FloatArray, error: Exception, unit: str = "") -> RunRecord:
     """The record of a run that could not make its first step."""
-    record = RunRecord(t0, state.copy())
+    record = RunRecord(t0, state.copy(), time_unit=unit)
     record.status = RunStatus.FAILED
     record.error = error
     record.message = f"Stopped at t = {time_text(t0)}{unit}: {error}."

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from benchmarks.thesis.entries import PRINTED
@@ -471,6 +473,22 @@ INVALID: dict[str, dict[str, Any]] = {
     "B raises": {"problem": problem_two(B=lambda t, x: 1 / 0)},
     "f is not finite": {"problem": problem_two(f=lambda t, x: x * np.nan)},
     "G B is singular": {"problem": problem_two(B=lambda t, x: np.array([-x[1], x[0]]))},
+    "g has redundant rows": {
+        "problem": srm.SemiExplicitDAE(
+            f=problem_two().f,
+            B=lambda t, x: np.array([x, 1.0 - x]).T,
+            g=lambda t, x: problem_two().g(t, x) * np.array([1.0, 2.0]),
+            G=lambda t, x: np.array([x, 2.0 * x]),
+        )
+    },
+    "B has columns that depend on each other": {
+        "problem": srm.SemiExplicitDAE(
+            f=problem_two().f,
+            B=lambda t, x: np.array([x, 2.0 * x]).T,
+            g=lambda t, x: x - START_TWO,
+            G=lambda t, x: np.eye(2),
+        )
+    },
     **{
         f"{name} is complex": {"problem": problem_two(**{name: lambda t, x: x + 0.5j})}
         for name in ("f", "B", "G")
@@ -580,8 +598,118 @@ def test_the_unit_of_the_states_does_not_change_the_steps(
 
 def test_states_far_below_the_absolute_tolerance_are_refused_with_the_remedy() -> None:
     problem = in_units(passing_singularity(), 1e-9, 1.0)
-    with pytest.raises(srm.InputError, match="give an atol below rtol times their size"):
+    with pytest.raises(srm.InputError, match="give an atol of rtol times the usual size of each"):
         srm.solve_dae(problem, (0.0, 1.0), START_PASSING * 1e-9)
+
+
+@pytest.mark.parametrize("tableau", ["dop853", "rodas5p"])
+@pytest.mark.parametrize("sizes", [(1e-6, 1e6), (1e6, 1e-6), (1.0, 1e-6)])
+def test_units_of_each_state_do_not_change_the_steps(
+    sizes: tuple[float, float], tableau: str
+) -> None:
+    """x = (cos t, sin t) in these units, which B does not follow as G does."""
+    units = np.array(sizes)
+    turn = np.array([[1.0, -1.0], [1.0, 1.0]])
+    circles = [
+        srm.SemiExplicitDAE(
+            f=lambda t, x, unit=unit: unit * (turn @ (x / unit)),
+            B=lambda t, x: x,
+            g=lambda t, x, unit=unit: 0.5 * ((x / unit) @ (x / unit) - 1.0),
+            G=lambda t, x, unit=unit: x / unit**2,
+        )
+        for unit in (np.ones(2), units)
+    ]
+    usual, run = (
+        srm.solve_dae(problem, (0.0, 3.0), [one[0], 0.0], tableau=tableau, atol=1e-6 * one)
+        for one, problem in zip((np.ones(2), units), circles)
+    )
+    assert run.success, run.message
+    assert run.stats.steps == usual.stats.steps
+    assert run.x[-1] / units == pytest.approx([np.cos(3.0), np.sin(3.0)], abs=1e-7)
+
+
+def changing_size(rate: float) -> tuple[srm.SemiExplicitDAE, Any]:
+    """x = a (X + (1, 2)), a = exp(rate t), X that of ``passing_singularity`` at 0.15 t, and x."""
+    inner, offset, pace = passing_singularity(), np.array([1.0, 2.0]), 0.15
+
+    def a(t: float) -> float:
+        return float(np.exp(rate * t))
+
+    def at(function: Any, t: float, x: np.ndarray) -> np.ndarray:
+        return function(pace * t, x / a(t) - offset)
+
+    problem = srm.SemiExplicitDAE(
+        f=lambda t, x: rate * x + a(t) * pace * at(inner.f, t, x),
+        B=lambda t, x: a(t) * at(inner.B, t, x),
+        g=lambda t, x: a(t) ** 2 * at(inner.g, t, x),
+        G=lambda t, x: a(t) * at(inner.G, t, x),
+        g_t=lambda t, x: rate * a(t) * (2 * a(t) * at(inner.g, t, x) - at(inner.G, t, x) @ x),
+    )
+    return problem, lambda t: a(t) * (solution_passing(pace * t) + offset)
+
+
+@pytest.mark.parametrize("rate", [-1.0, 1.0])
+def test_singular_points_are_passed_where_states_have_changed_by_orders_of_magnitude(
+    rate: float,
+) -> None:
+    """The size is exp(9) or exp(-9) at the passage, and exp(20) or exp(-20) at the end."""
+    problem, exact = changing_size(rate)
+    run = srm.solve_dae(problem, (0.0, 20.0), exact(0.0), rtol=1e-8, atol=1e-20)
+    assert run.success, run.message
+    assert run.stats.steps < 300
+    for t in (5.0, 8.0, 10.0, 20.0):
+        assert run(t)[0] / exact(t) == pytest.approx(1.0, abs=1e-7)
+
+
+@pytest.mark.parametrize("tableau", ["dop853", "rodas5p"])
+def test_a_circle_that_shrinks_is_no_singular_point(tableau: str) -> None:
+    problem = srm.SemiExplicitDAE(
+        f=lambda t, x: np.array([-x[1], x[0]]),
+        B=lambda t, x: x,
+        g=lambda t, x: 0.5 * (x @ x - np.exp(-2.0 * t)),
+        G=lambda t, x: x,
+        g_t=lambda t, x: np.exp(-2.0 * t),
+    )
+    run = srm.solve_dae(problem, (0.0, 20.0), [1.0, 0.0], tableau=tableau, atol=1e-18)
+    assert run.success, run.message
+    assert run.x[-1] * np.exp(20.0) == pytest.approx([np.cos(20.0), np.sin(20.0)], abs=1e-4)
+    assert run.y[:, 0] == pytest.approx(1.0, abs=1e-9)
+    assert run(1.0)[1] == pytest.approx(1.0, abs=1e-5)
+    assert "G B is almost singular" not in run.message
+    wide = srm.solve_dae(problem, (0.0, 20.0), [1.0, 0.0], tableau=tableau, rtol=1e-9)
+    assert "times the tolerance in x only" in wide.message
+    assert "give an atol of rtol times their size there" in wide.message
+
+
+@pytest.mark.parametrize("start", [-1.0, 0.0])
+def test_a_kink_at_the_start_or_at_the_end_is_no_wrong_derivative(start: float) -> None:
+    """x_1 = |x_0| - max(t, 1), of which the derivatives jump at x_0 = 0 and t = 1."""
+    kink = srm.SemiExplicitDAE(
+        f=lambda t, x: np.array([1.0, 0.0]),
+        B=lambda t, x: np.array([0.0, 1.0]),
+        g=lambda t, x: x[1] - abs(x[0]) + max(t, 1.0),
+        G=lambda t, x: np.array([-1.0 if x[0] >= 0.0 else 1.0, 1.0]),
+        g_t=lambda t, x: 1.0 if t >= 1.0 else 0.0,
+    )
+    run = srm.solve_dae(kink, (0.0, 1.0), [start, abs(start) - 1.0])
+    assert run.success, run.message
+    assert run.x[-1] == pytest.approx([start + 1.0, abs(start + 1.0) - 1.0], abs=1e-9)
+
+
+def test_a_time_derivative_that_is_right_at_the_start_alone_fails_the_run() -> None:
+    """x_0 = sin t, with a g_t that has the derivative of t."""
+    problem = srm.SemiExplicitDAE(
+        f=lambda t, x: np.zeros(1),
+        B=lambda t, x: np.ones(1),
+        g=lambda t, x: x[0] - np.sin(t),
+        G=lambda t, x: np.ones(1),
+        g_t=lambda t, x: -1.0,
+    )
+    run = srm.solve_dae(problem, (0.0, 1.0), [0.0])
+    assert run.status == "failed"
+    assert "g_t is [-1.], but dg/dt is [-0.54" in run.message
+    assert "Return the partial derivative of g with respect to t" in run.message
+    assert srm.solve_dae(replace(problem, g_t=lambda t, x: -np.cos(t)), (0.0, 1.0), [0.0]).success
 
 
 def test_a_jacobian_that_is_right_at_the_start_alone_fails_the_run() -> None:
@@ -670,3 +798,123 @@ def test_a_sigma_that_jumps_with_its_pivots_does_not_stop_the_run(seed: int) -> 
     assert run.success, run.message
     assert run.stats.steps < 60
     assert np.abs(run.x[-1] - at(4.0)).max() < 1e-3
+
+
+def test_messages_give_no_unit_to_the_independent_variable() -> None:
+    def half(t: float, x: np.ndarray) -> float:
+        return t - 0.5
+
+    half.terminal = True  # type: ignore[attr-defined]
+    whole = srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO)
+    assert whole.message == "The run reached t = 1."
+    ended = srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO, events=half)
+    assert ended.message == "The event 'half' ended the run at t = 0.5."
+    broken = srm.solve_dae(problem_two(f=late(np.full(2, np.nan))), (0.0, 1.0), START_TWO)
+    assert broken.message.startswith("Stopped at t = 0.5 with step ")
+    assert re.search(r"\bs\b", broken.message) is None
+    with pytest.raises(srm.InputError, match=r"the run covers t = 0 to 1, asked for are 2 to 2\."):
+        whole(2.0)
+
+
+def stiff_circle(rate: float) -> srm.SemiExplicitDAE:
+    """x = (cos s, sin s), s = sin t, to which the angle decays with ``rate``."""
+
+    def f(t: float, x: np.ndarray) -> np.ndarray:
+        speed = np.cos(t) - rate * (np.arctan2(x[1], x[0]) - np.sin(t))
+        return speed * np.array([-x[1], x[0]]) + np.cos(t) * x
+
+    return srm.SemiExplicitDAE(
+        f=f, B=lambda t, x: x, g=lambda t, x: 0.5 * (x @ x - 1.0), G=lambda t, x: x
+    )
+
+
+@pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
+@pytest.mark.parametrize(("rate", "steps"), [(1e1, 40), (1e3, 120), (1e5, 350)])
+def test_a_stiff_motion_along_a_curved_constraint_keeps_its_tolerance(
+    rate: float, steps: int, tableau: str
+) -> None:
+    """The stiff direction turns with it, so that steps grow like the fourth root of the rate."""
+    run = srm.solve_dae(stiff_circle(rate), (0.0, 3.0), [1.0, 0.0], rtol=1e-5, tableau=tableau)
+    assert run.success, run.message
+    angle = np.sin(run.t)
+    assert np.abs(run.x - np.array([np.cos(angle), np.sin(angle)]).T).max() < 2e-5
+    assert run.y[1:-1, 0] == pytest.approx(np.cos(run.t[1:-1]), abs=1e-9)
+    assert run.stats.steps < steps
+
+
+@pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
+def test_robertsons_kinetics_with_the_sum_as_a_constraint(tableau: str) -> None:
+    """Compared with Radau on the equations without a constraint, at a tighter tolerance."""
+
+    def kinetics(t: float, x: np.ndarray) -> np.ndarray:
+        first, second, third = 0.04 * x[0], 1e4 * x[1] * x[2], 3e7 * x[1] ** 2
+        return np.array([second - first, first - second - third, third])
+
+    problem = srm.SemiExplicitDAE(
+        f=lambda t, x: kinetics(t, x) * [1.0, 1.0, 0.0],
+        B=lambda t, x: np.array([0.0, 0.0, 1.0]),
+        g=lambda t, x: x.sum() - 1.0,
+        G=lambda t, x: np.ones(3),
+    )
+    start, end = [1.0, 0.0, 0.0], 1e4
+    run = srm.solve_dae(problem, (0.0, end), start, atol=[1e-8, 1e-12, 1e-8], tableau=tableau)
+    assert run.success, run.message
+    assert run.stats.steps < 300
+    exact = solve_ivp(kinetics, (0.0, end), start, method="Radau", rtol=1e-10, atol=1e-15).y[:, -1]
+    assert run.x[-1] / exact == pytest.approx(1.0, abs=2e-6)
+    assert run.y[-1, 0] == pytest.approx(-kinetics(end, exact)[2], rel=1e-4)
+
+
+@pytest.mark.parametrize("rate", [1e3, 1e6])
+@pytest.mark.parametrize("tableau", ["auto", "rodas5p"])
+def test_a_stiff_motion_passes_a_singular_point(tableau: str, rate: float) -> None:
+    """x_2 decays to x_0, with ``rate``, nonlinearly."""
+    inner = passing_singularity()
+
+    def f(t: float, x: np.ndarray) -> np.ndarray:
+        off = x[2] - x[0]
+        with np.errstate(over="ignore", invalid="ignore"):  # of explicit steps that are too long
+            decay = rate * (off + 0.3 * off**2)
+            return np.append(inner.f(t, x), 1.0 / (1.0 + x[0] ** 2) - decay)
+
+    problem = srm.SemiExplicitDAE(
+        f=f,
+        B=lambda t, x: np.append(inner.B(t, x), 0.0),
+        g=lambda t, x: inner.g(t, x),
+        G=lambda t, x: np.append(inner.G(t, x), 0.0),
+    )
+    run = srm.solve_dae(problem, (0.0, 3.0), [*START_PASSING, START_PASSING[0]], tableau=tableau)
+    assert run.success, run.message
+    exact = solution_passing(3.0)
+    assert run.x[-1] == pytest.approx([*exact, exact[0]], abs=1e-5)
+    assert run.stats.steps < 300
+
+
+@pytest.mark.parametrize("tableau", ["dop853", "dopr54"])
+def test_a_stiff_run_says_so(tableau: str) -> None:
+    """And where explicit steps were asked for, what to do about it."""
+    runs = {
+        name: srm.solve_dae(stiff_circle(1e3), (0.0, 1.0), [1.0, 0.0], rtol=1e-4, tableau=name)
+        for name in (tableau, "auto")
+    }
+    assert f"the stability of {tableau} limits its steps" in runs[tableau].message
+    assert "Stiff, with steps of rodas5p: t = 0." in runs["auto"].message
+    assert runs["auto"].settings.stiff
+    assert runs["auto"].stats.steps < runs[tableau].stats.steps
+    usual = srm.solve_dae(problem_two(), (0.0, 1.0), START_TWO, tableau=tableau)
+    assert usual.message == "The run reached t = 1."
+    assert usual.settings.stiff == ()
+
+
+def test_functions_of_one_state_may_return_numbers() -> None:
+    problem = srm.SemiExplicitDAE(
+        f=lambda t, x: -x[0],
+        B=lambda t, x: 1.0,
+        g=lambda t, x: x[0] - np.sin(t),
+        G=lambda t, x: 1.0,
+        g_t=lambda t, x: -np.cos(t),
+    )
+    run = srm.solve_dae(problem, (0.0, 1.0), [0.0])
+    assert run.success, run.message
+    assert run.x[:, 0] == pytest.approx(np.sin(run.t), abs=1e-14)
+    assert run.y[:, 0] == pytest.approx(-np.sin(run.t) - np.cos(run.t), abs=1e-13)

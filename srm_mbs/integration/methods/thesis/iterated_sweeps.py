@@ -253,7 +253,7 @@ class IteratedSweeps:
         """One step; see :class:`~srm_mbs.integration.methods.base.Method`."""
         eps = max(self.eps(h), EPS_DECREASE * memory.sweeps[-1].eps)
         if not (math.isfinite(eps) and eps > 0.0):
-            raise EvaluationError(f"eps = {eps} for the step {h:.1e} s")
+            raise EvaluationError(f"eps = {eps} for the step {h:.1e}{system.time_unit}")
         change = h * memory.sigma_slope
         gathered = self._gathered(system, memory, change)
         kept = memory.sweeps[-1].history
@@ -468,21 +468,21 @@ class IteratedSweeps:
         if restarted:
             text += (
                 f" The sweeps gave up their own histories in {len(restarted)} steps, first at "
-                f"t = {time_text(restarted[0])} s: sigma was falling, they were too far off the "
+                f"t = {time_text(restarted[0])}: sigma was falling, they were too far off the "
                 "constraints to tell the branch if a singular configuration came, and started "
                 "again from the accepted state."
             )
         if taken_over:
             text += (
                 f" {len(taken_over)} steps next to singular configurations, the first at "
-                f"t = {time_text(taken_over[0])} s, are of the split PSRM: rounding would have "
+                f"t = {time_text(taken_over[0])}, are of the split PSRM: rounding would have "
                 "exceeded the tolerance in sweeps."
             )
         worst = max(made, key=lambda step: step.drift_ratio, default=None)
         if norm.negligible > 0.0 and worst is not None and worst.drift_ratio > REPORTED_DRIFT:
             text += (
                 f" The last sweep was off the constraints by up to {worst.drift_ratio:.2g} times "
-                f"the tolerance (at t = {time_text(worst.t + worst.h)} s), which no step-size "
+                f"the tolerance (at t = {time_text(worst.t + worst.h)}), which no step-size "
                 "control mends: sweeps are accurate to a power of eps. Use restarted sweeps "
                 "(restart=True, carry=True), a smaller eps, or PSRM."
             )

@@ -342,6 +342,8 @@ def parse_xml(text: str, file: str, notes: list[str] | None = None) -> Element:
             file=file,
             remedy="Split the file, or remove what is not needed",
         )
+    if not text.strip():
+        raise InputError("the file has no content", file=file, remedy="Write the model into it")
     try:
         with naming(file=file):
             root = _parsed(text)

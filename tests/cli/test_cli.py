@@ -547,6 +547,21 @@ def test_the_commands_of_the_page_of_plots_write_their_pictures(
         assert (tmp_path / name).stat().st_size > 5000
 
 
+def test_play_writes_the_page_of_a_saved_run(saved_run: Path, tmp_path: Path) -> None:
+    trace = ("--trace", "rod:2,0,0")
+    output = run("play", saved_run, "--html", tmp_path / "played.html", *trace)
+    assert output == f"written: {tmp_path / 'played.html'}\n"
+    simulate = ("simulate", "slider_crank", "--t-end", 2, "--html", tmp_path / "simulated.html")
+    run(*simulate, *trace)
+    played, simulated = (
+        (tmp_path / f"{name}.html").read_bytes() for name in ("played", "simulated")
+    )
+    assert len(played) == pytest.approx(len(simulated), rel=0.01)
+    missing = tmp_path / "missing" / "page.html"
+    assert "there is no folder" in run("play", saved_run, "--html", missing, status=2)
+    assert "--html: the suffix '.txt'" in run("play", saved_run, "--html", "page.txt", status=2)
+
+
 @POSIX
 def test_play_serves_a_saved_run_until_it_is_interrupted(saved_run: Path) -> None:
     with started("play", saved_run) as process:

@@ -307,6 +307,8 @@ LARGEST_VALUE_DEPTH = 50
 _KEY_PART = r"""(?>[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 TABLE_TWICE = re.compile(r"Cannot declare .* twice", re.DOTALL)
 """Message of tomllib about a second [loop], which is meant as [[loop]]."""
+ESCAPE = re.compile(r"Unescaped '\\'|Invalid hex value")
+"""Messages of tomllib about what a backslash begins in double quotes, as in C:/Users of Windows."""
 DEEP_KEY = re.compile(rf"(?<![A-Za-z0-9_-])(?>{_KEY_PART}[ \t]*+\.[ \t]*+){{{LARGEST_KEY_DEPTH}}}")
 """Keys with more parts than that, for which the time of tomllib grows as their square."""
 
@@ -337,11 +339,16 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
         entries = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # an endless integer, nesting without end
         remedy = (
-            "Write double brackets above each table of a list, as [[loop]], and other tables once"
-            if TABLE_TWICE.match(str(error))
-            else "Correct it there; text stands in quotes, as keys with blanks or accents do, "
+            "Correct it there; text stands in quotes, as keys with blanks or accents do, "
             "lists in [ ]"
         )
+        if TABLE_TWICE.match(str(error)):
+            remedy = (
+                "Write double brackets above each table of a list, as [[loop]], and other tables "
+                "once"
+            )
+        elif ESCAPE.match(str(error)):
+            remedy = r"Write / instead of \ in paths, or the text in single quotes"
         raise InputError(
             f"this is not valid TOML: {_without_quotes(error)}", file=file, remedy=remedy
         ) from error

@@ -209,7 +209,8 @@ def check_output(path: Path | None, option: str, suffixes: tuple[str, ...]) -> N
     folder = path.parent
     if path.suffix.lower() not in suffixes:
         problem = f"the suffix {path.suffix!r} is not known here"
-        remedy = f"Use {' or '.join(suffixes)}"
+        *others, last = suffixes
+        remedy = f"Use {', '.join(others)} or {last}" if others else f"Use {last}"
     elif not folder.is_dir():
         problem, remedy = f"there is no folder {str(folder)!r}", "Make it first"
     elif path.is_dir():

@@ -431,6 +431,8 @@ def _parsed(text: str) -> Element:
 def _explained(error: ParseError) -> str:
     """The message of expat, which may quote the file, with the position."""
     words, _, position = str(error).rpartition(": ")
+    if words == "no element found":
+        words = "the file ends before its root element is closed"
     return f"{shortened(words)}: {position}"
 
 

@@ -155,6 +155,7 @@ DESCRIPTION_FAULTS = {
     "an absent urdf of Windows": ('"two_bars.urdf"', r"'C:\cad\other.urdf'"),
     "backslashes in double quotes": ("two_bars.urdf", r"C:\cad\other.urdf"),
     "a user of Windows": ("two_bars.urdf", r"C:\Users\other.urdf"),
+    "a mistyped key": ('type = "point_on_line"', 'typ = "point_on_line"'),
     "a folder as urdf": ('"two_bars.urdf"', '"."'),
     "an empty urdf": ('"two_bars.urdf"', '""'),
     "a null in urdf": ("two_bars.urdf", "two\\u0000bars.urdf"),

@@ -33,6 +33,7 @@ from srm_mbs.cli.output import (
     RUN_FAILED,
     Html,
     Lines,
+    PrintedLines,
     check_output,
     echo,
     flush_output,
@@ -47,10 +48,14 @@ from srm_mbs.cli.output import (
 from srm_mbs.errors import InputError
 
 if TYPE_CHECKING:
+    from srm_mbs._typing import FloatArray
     from srm_mbs.dynamics.mechanism import Mechanism
 
 T_END, RTOL = 10.0, 1e-6
 """End time (s) and tolerance where neither the command nor the description gives one."""
+STANDARD_OUTPUT = Path("-")
+MOST_ROWS = 10_000_000
+"""Of a table at equal times."""
 HARNESS = Path("benchmarks", "work_precision", "__main__.py")
 """The benchmark in a checkout of the source."""
 
@@ -150,7 +155,16 @@ def simulate(
     out: Annotated[Path | None, option("RUN.npz", "Save the run, for plot and play.")] = None,
     plot: Annotated[Path | None, option("FILE", "Plot the run as .png, .pdf or .svg.")] = None,
     csv: Annotated[
-        Path | None, option("FILE.csv", "Write the motion at the steps as a table.")
+        Path | None,
+        option(
+            "FILE.csv",
+            "Write the motion at the steps as a table; - prints it, and the summary on standard "
+            "error.",
+        ),
+    ] = None,
+    every: Annotated[
+        float | None,
+        option("S", "Write a row of the table every S seconds instead.", show_default="the steps"),
     ] = None,
     points: Annotated[
         list[str] | None,
@@ -230,7 +244,8 @@ def simulate(
         from srm_mbs.visualization.plotting.figure import FORMATS
 
         check_output(plot, "--plot", FORMATS)
-    check_output(csv, "--csv", (".csv",))
+    printed = csv == STANDARD_OUTPUT
+    check_output(None if printed else csv, "--csv", (".csv",))
     check_output(html, "--html", HTML_SUFFIXES)
     picture = playback.image_options(image, at, size, dpi)
     playback.check_video(video)
@@ -247,6 +262,12 @@ def simulate(
         )
     for point in added:
         place_of(mechanism, point, "--point")
+    if every is not None and csv is None:
+        raise InputError(
+            "it is about the table of the motion, and none is asked for",
+            element="--every",
+            remedy="Give --csv too",
+        )
     if full_paths and out is None:
         raise InputError(
             "it is about the saved run, and none is asked for",
@@ -256,6 +277,8 @@ def simulate(
     defaults = mechanism.defaults
     t_end = _first(t_end, defaults.t_end, T_END)
     playback.check_time(at, t_end)
+    if every is not None:
+        _equal_times(every, t_end)
     controller = None
     if control:
         controls = named_numbers(control, "--control", "actuator", "hip")
@@ -274,29 +297,56 @@ def simulate(
         backend=backend,
         singular_tolerance=_first(singular_tolerance, None, SINGULAR_TOLERANCE),
     )
+    times = None if every is None else _equal_times(every, float(solution.t[-1]))
     written, failed = write_files(
         [
             (out, partial(solution.save, full_paths=full_paths)),
             (plot, solution.plot),
-            (csv, partial(solution.to_csv, points=added)),
+            (None if printed else csv, partial(solution.to_csv, t=times, points=added)),
             (html, partial(solution.export_html, **overlays)),
             (image, partial(solution.export_image, **picture, **overlays)),
             (video, partial(solution.export_video, progress=True, **overlays)),
         ]
     )
     rows = run_rows(solution, passages=solution.status != "interrupted")
-    table([*rows, *(("written", str(path)) for path in written)])
+    if printed:
+        from srm_mbs.simulation.csv_export import write_csv
+
+        shown = solution if times is None else solution.at(times)
+        write_csv(shown, PrintedLines(), added, reactions=False)
+    table([*rows, *(("written", str(path)) for path in written)], err=printed)
     if balance:
         from srm_mbs.cli.tables import balance_rows
 
-        table(balance_rows(solution.energy_balance))
-    echo(solution.message, err=not solution.success)
+        table(balance_rows(solution.energy_balance), err=printed)
+    echo(solution.message, err=printed or not solution.success)
     if play or view:
         playback.play_run(solution, overlays, view)
     if failed:
         raise typer.Exit(BAD_INPUT)
     if not solution.success:
         raise typer.Exit(RUN_FAILED)
+
+
+def _equal_times(every: float, end: float) -> FloatArray:
+    """Times (k,) s from 0 to ``end`` (s), ``every`` seconds apart.
+
+    Raises
+    ------
+    InputError
+        For an interval that is not positive, or more than :data:`MOST_ROWS` of them.
+    """
+    if not every > 0.0 or end / every > MOST_ROWS:
+        raise InputError(
+            f"an interval of {every:g} s gives no table of {end:g} s",
+            element="--every",
+            remedy=f"Give at least {max(end, 1e-300) / MOST_ROWS:.1g} s",
+        )
+    import numpy as np
+
+    # A last time that rounding moves beyond the end is the end.
+    times: FloatArray = np.minimum(every * np.arange(int(end / every * (1.0 + 1e-12)) + 1), end)
+    return times
 
 
 def _vector(text: str | None, element: str) -> list[float] | None:

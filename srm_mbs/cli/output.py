@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import sys
@@ -162,8 +163,9 @@ def _as_written(error: InputError, element: str, command: Callable[..., None]) -
     return element
 
 
-def table(rows: Iterable[Iterable[str]], header: Sequence[str] = ()) -> None:
-    """Aligned columns on standard output; wrapped on a terminal, never in a pipe."""
+def table(rows: Iterable[Iterable[str]], header: Sequence[str] = (), err: bool = False) -> None:
+    """Aligned columns on standard output, or on standard error; wrapped on a terminal, never in a
+    pipe."""
     from rich.console import Console
     from rich.table import Table
 
@@ -172,12 +174,22 @@ def table(rows: Iterable[Iterable[str]], header: Sequence[str] = ()) -> None:
     for row in rows:
         grid.add_row(*map(printable, row))
     # No markup: "[0]" in a name is text.
-    width = None if sys.stdout is not None and sys.stdout.isatty() else 10_000
+    stream = sys.stderr if err else sys.stdout
+    width = None if stream is not None and stream.isatty() else 10_000
     console = Console(width=width, markup=False, emoji=False, highlight=False)
     with console.capture() as captured:
         console.print(grid)
     # rich pads the last column with spaces.
-    typer.echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
+    typer.echo("\n".join(line.rstrip() for line in captured.get().splitlines()), err=err)
+
+
+class PrintedLines(io.TextIOBase):
+    """A text file whose lines are printed by :func:`echo`."""
+
+    def write(self, text: str) -> int:
+        """Print ``text``, which ends with the end of a line."""
+        echo(text.removesuffix("\n"))
+        return len(text)
 
 
 # -- output files -----------------------------------------------------------------------------
@@ -197,7 +209,8 @@ def check_output(path: Path | None, option: str, suffixes: tuple[str, ...]) -> N
     folder = path.parent
     if path.suffix.lower() not in suffixes:
         problem = f"the suffix {path.suffix!r} is not known here"
-        remedy = f"Use {' or '.join(suffixes)}"
+        *others, last = suffixes
+        remedy = f"Use {', '.join(others)} or {last}" if others else f"Use {last}"
     elif not folder.is_dir():
         problem, remedy = f"there is no folder {str(folder)!r}", "Make it first"
     elif path.is_dir():

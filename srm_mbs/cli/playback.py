@@ -15,7 +15,9 @@ import typer
 import srm_mbs
 from srm_mbs.cli.output import (
     BAD_INPUT,
+    HTML_SUFFIXES,
     AllowOutside,
+    Html,
     Run,
     check_output,
     echo,
@@ -256,6 +258,7 @@ def given_points(texts: list[str], element: str) -> list[srm_mbs.Anchor]:
 @reported
 def play(
     run: Run,
+    html: Html = None,
     image: Image = None,
     at: At = None,
     size: Size = None,
@@ -269,18 +272,20 @@ def play(
 ) -> None:
     """Play a saved run in the browser.
 
-    With --image or --video, write these instead.
+    With --html, --image or --video, write these instead.
     """
+    check_output(html, "--html", HTML_SUFFIXES)
     picture = image_options(image, at, size, dpi)
     check_video(video)
     solution = srm_mbs.load_solution(run, allow_outside=allow_outside)
     check_time(at, solution.span[1], solution.span[0])
     options = overlay_options(solution.mechanism, trace, gaps, reactions, arrows)
-    if image is None and video is None:
+    if html is None and image is None and video is None:
         play_run(solution, options)
         return
     written, failed = write_files(
         [
+            (html, partial(solution.export_html, **options)),
             (image, partial(solution.export_image, **picture, **options)),
             (video, partial(solution.export_video, progress=True, **options)),
         ]

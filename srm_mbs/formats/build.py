@@ -35,6 +35,7 @@ from srm_mbs.formats.csv_table import CsvFolder
 from srm_mbs.formats.plausibility import (
     doubtful_angles,
     doubtful_inertias,
+    doubtful_lengths,
     doubtful_rotations,
 )
 from srm_mbs.formats.toml.description import Description, check_description, parse_toml
@@ -476,7 +477,8 @@ def _with_doubts(mechanism: Mechanism, reading: Reading) -> Mechanism:
     that keeps a loop from moving; warnings say the same."""
     doubts = [
         *_doubtful_angles(mechanism, reading),
-        *doubtful_inertias(mechanism),
+        # Moments of inertia in other units than the lengths say nothing about the lengths.
+        *(list(doubtful_inertias(mechanism)) or doubtful_lengths(mechanism)),
     ]
     if mechanism.loops and mechanism.degrees_of_freedom == 0 and not mechanism.drives:
         inclined = inclined_axes(mechanism).values()

@@ -42,7 +42,7 @@ from srm_mbs.model.numbers import (
     name_list,
     positive_integer,
 )
-from srm_mbs.model.reach import Reach, folder_list
+from srm_mbs.model.reach import Reach, folder_list, path_remedy
 
 log = get_logger(__name__)
 
@@ -319,7 +319,7 @@ def _of_tables(
         try:
             model = Document.read(path)
         except InputError as error:
-            relative = "Check the path, which is relative to the description"
+            relative = path_remedy(name, "the description")
             raise InputError(
                 f"the {key.upper()} {name!r} cannot be read ({error.problem}: {str(path)!r})",
                 file=own.file,

@@ -8,6 +8,7 @@ from itertools import islice
 from typing import Any
 from xml.etree.ElementTree import Element
 
+import numpy as np
 import pinocchio as pin
 
 from srm_mbs.assembly.regular_start import BEYOND_ROUNDING, bodies_at_start
@@ -29,6 +30,10 @@ LARGEST_GYRATION = 10.0
 """Radius of gyration of a body, over the size of the mechanism, above which a unit is doubtful."""
 SMALLEST_GYRATION = 1e-3
 """The same over the size of the body, below which it is; point masses have none."""
+LEAST_DENSITY = 1e-3
+"""Mean density (kg/m^3) of the bodies of a mechanism below which its lengths are doubtful: a
+thousandth of that of air.  Lengths in mm make steel 8e-6 of it, the bundled mechanisms have 40 and
+more."""
 
 
 def doubtful_angles(
@@ -117,6 +122,33 @@ def doubtful_inertias(mechanism: Mechanism) -> Iterator[str]:
                 f"{size:.3g} m: lengths are in m (1 mm is 0.001 m), and moments of inertia in "
                 "kg m^2"
             )
+
+
+def doubtful_lengths(mechanism: Mechanism) -> Iterator[str]:
+    """A sentence about bodies that are too light for their size, as with lengths, and moments of
+    inertia with them, in mm.
+
+    The volume of a body is that of the homogeneous cuboid with its mass and principal moments of
+    inertia I_k about its centre of mass, with edges a_k^2 = 6 (trace - 2 I_k)/m; that of a rod or
+    plate without thickness is zero.
+    """
+    bodies = numbers_of_tree(mechanism).bodies[1:]
+    bodies = bodies[bodies[:, 0] > 0.0]
+    masses, moments = bodies[:, 0], bodies[:, 4:]
+    mass = float(masses.sum())
+    # Edges of a cube have 2 trace/m each, which is the largest volume for the trace.
+    squares = 2.0 * np.maximum(moments[:, [0, 3, 5]].sum(axis=1), 0.0) / masses
+    if mass >= LEAST_DENSITY * float((squares**1.5).sum()):
+        return
+    principal = np.linalg.eigvalsh(moments[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
+    squares = 6.0 * (principal.sum(axis=1, keepdims=True) - 2.0 * principal) / masses[:, None]
+    volume = float(np.sqrt(np.maximum(squares, 0.0).prod(axis=1)).sum())
+    if mass < LEAST_DENSITY * volume:
+        yield (
+            f"the bodies have {mass:.3g} kg, and by their moments of inertia {volume:.3g} m^3, so "
+            f"that they are lighter than air ({mass / volume:.1g} kg/m^3): lengths are in m (1 mm "
+            "is 0.001 m), and moments of inertia in kg m^2 (1 kg mm^2 is 1e-6 kg m^2)"
+        )
 
 
 def _body(model: pin.Model, joint: int) -> str:

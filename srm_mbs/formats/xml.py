@@ -342,6 +342,8 @@ def parse_xml(text: str, file: str, notes: list[str] | None = None) -> Element:
             file=file,
             remedy="Split the file, or remove what is not needed",
         )
+    if not text.strip():
+        raise InputError("the file has no content", file=file, remedy="Write the model into it")
     try:
         with naming(file=file):
             root = _parsed(text)
@@ -429,6 +431,8 @@ def _parsed(text: str) -> Element:
 def _explained(error: ParseError) -> str:
     """The message of expat, which may quote the file, with the position."""
     words, _, position = str(error).rpartition(": ")
+    if words == "no element found":
+        words = "the file ends before its root element is closed"
     return f"{shortened(words)}: {position}"
 
 

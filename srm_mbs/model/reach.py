@@ -38,6 +38,13 @@ LONGEST_PATH = 1000
 """Characters of the name of a file in a mechanism."""
 
 
+def path_remedy(name: str, relative_to: str = "") -> str:
+    """Remedy for a ``name`` in a file that leads to no file, which may be
+    ``relative_to`` something."""
+    verb = "Write / instead of \\ in" if "\\" in name else "Check"
+    return f"{verb} the path{f', which is relative to {relative_to}' * bool(relative_to)}"
+
+
 @dataclass(frozen=True)
 class Reach:
     """The folders from which a mechanism may read further files.
@@ -129,7 +136,7 @@ class Reach:
             outside = outside or candidate
         if outside is not None:
             raise self.refusal(name, what)
-        raise InputError(f"there is no {what} {name!r}", remedy="Check the path")
+        raise InputError(f"there is no {what} {name!r}", remedy=path_remedy(name))
 
     def searched(self, folder: Path) -> tuple[Path, ...]:
         """Where the files that a file in ``folder`` names are searched, for messages; files of a

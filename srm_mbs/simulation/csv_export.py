@@ -57,7 +57,7 @@ _COMPONENTS = {
 
 def write_csv(
     solution: SimulationResult,
-    path: str | Path,
+    path: str | Path | io.TextIOBase,
     points: Sequence[Anchor | str],
     reactions: bool,
 ) -> None:
@@ -65,6 +65,8 @@ def write_csv(
 
     Parameters
     ----------
+    path
+        File name, or an open text file.
     points
         Anchors, or names of points of the mechanism, whose motion is added.
     reactions
@@ -87,23 +89,30 @@ def write_csv(
     write_table(columns, path)
 
 
-def write_table(columns: Mapping[str, NDArray[Any]], path: str | Path) -> None:
-    """Write ``columns``, header -> values (n,), to ``path``.
+def write_table(columns: Mapping[str, NDArray[Any]], path: str | Path | io.TextIOBase) -> None:
+    """Write ``columns``, header -> values (n,), to ``path``, a file name or an open text file.
 
     Raises
     ------
     OSError
         If the file cannot be written.
     """
+    if not isinstance(path, str | Path):
+        _write_rows(columns, path)
+        return
     with writing(path) as file:
         text = io.TextIOWrapper(file, encoding="utf-8", errors="backslashreplace", newline="")
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(map(text_cell, columns))
-        # Python's own floats: the csv module writes them with repr.
-        writer.writerows(zip(*(_cells(column) for column in columns.values())))
+        _write_rows(columns, text)
         text.flush()
         text.detach()  # the file is closed by its owner
     log.info("written: %s", path)
+
+
+def _write_rows(columns: Mapping[str, NDArray[Any]], text: io.TextIOBase) -> None:
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(map(text_cell, columns))
+    # Python's own floats: the csv module writes them with repr.
+    writer.writerows(zip(*(_cells(column) for column in columns.values())))
 
 
 def _cells(column: NDArray[Any]) -> list[Any]:

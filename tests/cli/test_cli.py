@@ -547,6 +547,54 @@ def test_the_commands_of_the_page_of_plots_write_their_pictures(
         assert (tmp_path / name).stat().st_size > 5000
 
 
+def test_a_table_of_equal_times_has_the_states_of_dense_output(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    run("simulate", "four_bar", "--t-end", 0.35, "--csv", path, "--every", 0.1)
+    head, *rows = path.read_text(encoding="utf-8").splitlines()
+    table = np.array([[float(cell) for cell in line.split(",")] for line in rows])
+    np.testing.assert_allclose(table[:, 0], [0.0, 0.1, 0.2, 0.3], rtol=1e-15)
+    q, v = srm.simulate(srm.load("four_bar"), 0.35, rtol=1e-6)(table[:, 0])
+    np.testing.assert_allclose(table[:, 1:4], q, atol=1e-9)
+    np.testing.assert_allclose(table[:, 4:7], v, atol=1e-9)
+    assert head.startswith("t (s),crank (rad),")
+    # 3 times 0.1 is above 0.3: the last row is the end of the run.
+    run("simulate", "four_bar", "--t-end", 0.3, "--csv", path, "--every", 0.1)
+    assert path.read_text(encoding="utf-8").splitlines()[-1].startswith("0.3,")
+
+
+def test_a_printed_table_is_all_of_standard_output(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    options = ("--t-end", 0.3, "--backend", "python", "--every", 0.1)
+    run("simulate", "four_bar", *options, "--csv", path)
+    done = run_apart("simulate", "four_bar", *options, "--csv", "-", "--balance")
+    assert done.returncode == 0
+    assert done.stdout == path.read_text(encoding="utf-8")
+    assert "energy gained" in done.stderr
+    assert "The run reached t = 0.3 s." in done.stderr
+    assert not Path("-").exists()
+
+
+@pytest.mark.parametrize("every", [0, -1, "nan", 1e-12])
+def test_an_interval_that_gives_no_table_is_refused_before_the_run(every: object) -> None:
+    options = ("--t-end", 1, "--csv", "-", "--every", every)
+    assert "--every: an interval of" in run("simulate", "four_bar", *options, status=2)
+
+
+def test_play_writes_the_page_of_a_saved_run(saved_run: Path, tmp_path: Path) -> None:
+    trace = ("--trace", "rod:2,0,0")
+    output = run("play", saved_run, "--html", tmp_path / "played.html", *trace)
+    assert output == f"written: {tmp_path / 'played.html'}\n"
+    simulate = ("simulate", "slider_crank", "--t-end", 2, "--html", tmp_path / "simulated.html")
+    run(*simulate, *trace)
+    played, simulated = (
+        (tmp_path / f"{name}.html").read_bytes() for name in ("played", "simulated")
+    )
+    assert len(played) == pytest.approx(len(simulated), rel=0.01)
+    missing = tmp_path / "missing" / "page.html"
+    assert "there is no folder" in run("play", saved_run, "--html", missing, status=2)
+    assert "--html: the suffix '.txt'" in run("play", saved_run, "--html", "page.txt", status=2)
+
+
 @POSIX
 def test_play_serves_a_saved_run_until_it_is_interrupted(saved_run: Path) -> None:
     with started("play", saved_run) as process:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,43 @@ def test_equilibrium_prints_stability_and_what_holds() -> None:
     assert row(held, "to hold crank") == f"{force[0]:.6g} N m"
     assert row(held, "crank") == "0.5 rad"
     assert "on a singular configuration" in run("equilibrium", "slider_crank")
+
+
+NOISE = re.compile(r"(?<![\w.])-?[\d.]+e-(1[3-9]|[2-9]\d)")
+"""Numbers below 1e-12."""
+
+
+@pytest.mark.parametrize("name", ["stewart_platform", "quick_return", "flyball_governor"])
+def test_rounding_of_zeros_is_printed_as_zero(name: str) -> None:
+    found = srm.equilibrium(srm.load(name))
+    lines = run("equilibrium", name).splitlines()
+    shown = [line for line in lines if not line.startswith("force left")]  # a measure of rounding
+    assert not NOISE.search("\n".join(shown))
+    assert not NOISE.search(run("linearise", name))
+    for joint, wrench in found.reactions.items():  # what is no rounding is printed in full
+        largest = wrench[:3][np.argmax(np.abs(wrench[:3]))]
+        assert f"{largest:.6g}" in row("\n".join(lines), f"reaction {joint}")
+
+
+def test_small_numbers_among_small_ones_are_printed_in_full(tmp_path: Path) -> None:
+    tiny = srm.planar(
+        points={"O": (0, 0), "A": (1e-6, 0)},
+        bars={"bar": ("O", "A")},
+        ground=("O",),
+        mass_per_length=1e-9,
+    )
+    tiny.save(tmp_path / "tiny.toml")
+    held = run("equilibrium", tmp_path / "tiny.toml", "--hold", "O=0")
+    # 1e-15 kg at half of 1e-6 m.
+    assert float(row(held, "to hold O").split()[0]) == pytest.approx(9.81 * 0.5e-21, rel=1e-5)
+
+
+def test_a_motion_without_stiffness_is_called_neutral() -> None:
+    output = run("equilibrium", "flyball_governor")
+    assert row(output, "equilibrium") == "neutral"
+    assert row(output, "small motion") == "neutral: it neither swings nor leaves"
+    modes = run("linearise", "flyball_governor").split("mode  eigenvalue")[1].splitlines()
+    assert [line.split()[:4] for line in modes[1:3]] == [["0", "0", "0", "1"], ["1", "0", "0", "1"]]
 
 
 def test_linearise_prints_matrices_and_modes_and_writes_a_page(tmp_path: Path) -> None:

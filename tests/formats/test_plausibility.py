@@ -148,6 +148,50 @@ def test_lengths_in_millimetres_beside_inertias_in_si_units_are_doubted() -> Non
     )
 
 
+def _enlarged(factor: float, mass: float) -> Callable[[str], str]:
+    """A URDF with lengths ``factor``, and masses ``mass``, times as large."""
+    moments = with_factor("inertia", "i..", mass * factor**2)
+    masses = with_factor("mass", "value", mass)
+
+    def place(found: re.Match[str]) -> str:
+        return f'xyz="{" ".join(repr(factor * float(x)) for x in found[1].split())}"'
+
+    def urdf(text: str) -> str:
+        return moments(masses(re.sub(r'(?<!axis )xyz="([^"]*)"', place, text)))
+
+    return urdf
+
+
+def _enlarged_closure(factor: float) -> Callable[[str], str]:
+    return lambda text: text.replace("[2.0, 0.0, 0.0]", f"[{factor * 2.0!r}, 0.0, 0.0]").replace(
+        "[1.5, 0.0, 0.0]", f"[{factor * 1.5!r}, 0.0, 0.0]"
+    )
+
+
+def test_lengths_and_moments_of_inertia_in_millimetres_are_doubted(
+    changed: Callable[..., Path],
+) -> None:
+    (said,) = doubts(changed(_enlarged(1e3, 1.0), _enlarged_closure(1e3)))
+    assert "lighter than air" in said
+    assert "lengths are in m (1 mm is 0.001 m)" in said
+    # Cuboids of the bundled bars: 0.1 m wide, 4.5 m long together, 4.5 kg, 1000 times larger.
+    mechanism_density = float(re.search(r"\((.*) kg/m\^3\)", said)[1])
+    original = srm.load("four_bar")
+    volume = 0.0
+    for body in original.model.inertias.tolist()[1:]:
+        moments = np.linalg.eigvalsh(body.inertia)
+        volume += np.sqrt(np.prod(6.0 * (moments.sum() - 2.0 * moments) / body.mass))
+    mass = sum(body.mass for body in original.model.inertias.tolist()[1:])
+    assert mechanism_density == pytest.approx(mass / volume * 1e-9, rel=0.06)  # of one digit
+
+
+@pytest.mark.parametrize(("factor", "mass"), [(1e2, 1e6), (1e3, 1e9), (1e-3, 1e-9), (1e-6, 1e-18)])
+def test_large_and_small_mechanisms_of_the_density_of_bodies_are_not_doubted(
+    changed: Callable[..., Path], factor: float, mass: float
+) -> None:
+    assert doubts(changed(_enlarged(factor, mass), _enlarged_closure(factor))) == []
+
+
 def test_moments_of_inertia_without_a_mass_are_doubted(changed: Callable[..., Path]) -> None:
     (said,) = doubts(changed(lambda text: text.replace('mass value="1"', 'mass value="0"')))
     assert "the body of the joint 'crank' ('crank') has moments of inertia, 0.08" in said

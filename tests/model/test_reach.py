@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -89,6 +91,38 @@ def test_one_warning_sums_up_missing_meshes_and_bars_stand_for_their_links(
     assert said.startswith(f"{gone} of 4 visuals are not drawn, of the links 'world', ")
     assert "there is no mesh file 'package://gone/bar.obj'" in said
     assert f"Searched in {model}, {model.parent / 'other'};" in said
+
+
+@pytest.mark.skipif(os.sep != "/", reason="a backslash separates folders here")
+def test_a_path_of_windows_to_a_mesh_is_named_as_such(
+    model: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert not drawn(srm.load(robot(model, "meshes\\a.obj")))
+    assert "Write / instead of \\ in the path." in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("scale", "doubted"),
+    [("1000 1000 1000", True), ("150 150 150", True), ("1 1 1", False), ("1e-4 1e-4 1e-4", False)],
+)
+def test_a_mesh_in_mm_on_a_moving_body_is_doubted(
+    scale: str, doubted: bool, model: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The tree of 1.03 m has a mesh with a box of sqrt(3) m, ``scale`` times."""
+    (model / "a.obj").write_text(TETRAHEDRON)
+    visual = VISUAL.format("a.obj").replace("/></geo", f' scale="{scale}"/></geo')
+    on_ground = tree().replace('<link name="base"/>', f'<link name="base">{visual}')
+    for link, moves, text in (
+        ("ground", False, on_ground),
+        ("link", True, tree().replace("</link>", visual, 1)),
+    ):
+        (model / f"{link}.urdf").write_text(text)
+        caplog.clear()
+        visuals_of(srm.load(model / f"{link}.urdf"))
+        assert ("lengths of meshes are in m" in caplog.text) == (doubted and moves)
+        if doubted and moves:
+            size = np.sqrt(3.0) * float(scale.split()[0])
+            assert f"is {size:.3g} m large" in caplog.text
 
 
 @pytest.mark.parametrize("manifest", ["package.xml", "model.config"])

@@ -28,6 +28,7 @@ from srm_mbs.formats.toml.schema import (
     TopEntry,
 )
 from srm_mbs.formats.translation import MODEL_KEYS, PLANAR
+from srm_mbs.formats.xml import parse_numbers
 from srm_mbs.model.actuators import Actuator, naming_actuator
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.closures import CLOSURE_TYPES, LoopClosure
@@ -307,6 +308,8 @@ LARGEST_VALUE_DEPTH = 50
 _KEY_PART = r"""(?>[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 TABLE_TWICE = re.compile(r"Cannot declare .* twice", re.DOTALL)
 """Message of tomllib about a second [loop], which is meant as [[loop]]."""
+ESCAPE = re.compile(r"Unescaped '\\'|Invalid hex value")
+"""Messages of tomllib about what a backslash begins in double quotes, as in C:/Users of Windows."""
 DEEP_KEY = re.compile(rf"(?<![A-Za-z0-9_-])(?>{_KEY_PART}[ \t]*+\.[ \t]*+){{{LARGEST_KEY_DEPTH}}}")
 """Keys with more parts than that, for which the time of tomllib grows as their square."""
 
@@ -337,11 +340,16 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
         entries = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # an endless integer, nesting without end
         remedy = (
-            "Write double brackets above each table of a list, as [[loop]], and other tables once"
-            if TABLE_TWICE.match(str(error))
-            else "Correct it there; text stands in quotes, as keys with blanks or accents do, "
+            "Correct it there; text stands in quotes, as keys with blanks or accents do, "
             "lists in [ ]"
         )
+        if TABLE_TWICE.match(str(error)):
+            remedy = (
+                "Write double brackets above each table of a list, as [[loop]], and other tables "
+                "once"
+            )
+        elif ESCAPE.match(str(error)):
+            remedy = r"Write / instead of \ in paths, or the text in single quotes"
         raise InputError(
             f"this is not valid TOML: {_without_quotes(error)}", file=file, remedy=remedy
         ) from error
@@ -427,7 +435,7 @@ def check_description(entries: Mapping[str, Any], file: str) -> Description:
 
 PROBLEMS: dict[str, tuple[str | None, str]] = {
     "string_type": ("a text is wanted", "Put it in quotes"),
-    "list_type": ("a list is wanted", "Write [...], or [[...]] above each table of a list"),
+    "list_type": ("a list is wanted", "Write [...]"),
     "dict_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
     "model_attributes_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
     "model_type": ("a table is wanted", "Write { key = value } or [...] above its keys"),
@@ -444,7 +452,11 @@ PROBLEMS: dict[str, tuple[str | None, str]] = {
 
 def _explain(error: ValidationError) -> tuple[str, str, str]:
     """Key, problem and remedy of the first error."""
-    first = error.errors()[0]
+    errors = error.errors()
+    first = errors[0]
+    if first["type"] == "missing":  # an unknown key beside it is that key, mistyped
+        beside = (e for e in errors if e["type"] == "extra_forbidden" and _beside(e, first))
+        first = next(beside, first)
     location = _location(first)
     key = _key_path(location)
     if first["type"] == "extra_forbidden":
@@ -464,9 +476,19 @@ def _explain(error: ValidationError) -> tuple[str, str, str]:
         return key, f"{count} values are wanted, not {given}", f"Give {count} values"
     message = f"{first['msg'][0].lower()}{first['msg'][1:]}"
     problem, remedy = PROBLEMS.get(first["type"], (None, "Correct the value"))
+    if first["type"] == "list_type" and isinstance(first.get("input"), dict):
+        remedy = "Write [[...]] above each table of the list"
+    elif first["type"] == "list_type" and isinstance(first.get("input"), str):
+        numbers = parse_numbers(first["input"].replace(",", " "))
+        remedy = f"Write [{', '.join(f'{x:g}' for x in numbers)}]" if numbers else remedy
     if location[0] == "initial" and first["type"] == "number":
         remedy = "Give a finite number, or a list of them for a joint with several coordinates"
     return key, f"{problem or message}, not {_shortened(first.get('input'))}", remedy
+
+
+def _beside(error: Any, other: Any) -> bool:
+    """Whether two errors are about keys of one table."""
+    return bool(error["loc"][:-1] == other["loc"][:-1])
 
 
 def _location(error: Any) -> tuple[int | str, ...]:

@@ -7,8 +7,9 @@ visuals is drawn as bars between its joints and loop anchors.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -19,6 +20,7 @@ import pinocchio as pin
 from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
+from srm_mbs.dynamics.scaling import coordinate_units
 from srm_mbs.errors import InputError, get_logger, joined_names
 from srm_mbs.formats.meshes import read_mesh
 from srm_mbs.formats.xml import parse_numbers, parse_xml
@@ -42,6 +44,8 @@ PIN_COLOUR: Colour = (0.15, 0.16, 0.18, 1.0)
 ANCHOR_COLOUR: Colour = (0.835, 0.369, 0.000, 1.0)
 BAR_THICKNESS = 0.025
 """Thickness of a bar over the mechanism's extent, in drawings without visuals."""
+LARGEST_MESH = 100.0
+"""Size of the mesh of a moving body, over that of the mechanism, above which a unit is doubtful."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +151,8 @@ def visuals_of(
         bars = _skeleton(mechanism, loops, bare) if bare else []
     if left_out and mechanism.source is not None:
         log.warning("%s", _left_out_text(left_out, len(found), mechanism.source))
+    for text in islice(_oversized(mechanism, found), 1):
+        log.warning("%s", text)
     return [*found, *bars]
 
 
@@ -205,6 +211,20 @@ def _urdf_visuals(mechanism: Mechanism) -> tuple[list[Visual], list[_LeftOut]]:
             else:
                 found.append(visual)
     return found, left_out
+
+
+def _oversized(mechanism: Mechanism, visuals: Sequence[Visual]) -> Iterator[str]:
+    """Sentences about meshes of moving bodies whose files may be in mm."""
+    for visual in visuals:
+        if visual.joint and isinstance(visual.shape, Mesh):
+            size = float(np.linalg.norm(np.diff(bounding_box(visual.shape), axis=0)))
+            scene = coordinate_units(mechanism, mechanism.q0, mechanism.v0).length
+            if size > LARGEST_MESH * scene:
+                yield (
+                    f"the mesh of the joint {mechanism.model.names[visual.joint]!r} is {size:.3g} "
+                    f"m large, in a mechanism of {scene:.3g} m: lengths of meshes are in m; those "
+                    'of files in mm take scale="0.001 0.001 0.001" in <mesh>'
+                )
 
 
 def _numbers(element: Element, key: str, default: str) -> list[float]:

@@ -198,6 +198,14 @@ def test_keys_play_pause_and_scrub(page: Any) -> None:
     page.locator("#marks button").first.focus()
     page.keyboard.press("Enter")
     assert page.evaluate("animator.time") == pytest.approx(first)
+    # A click of the mouse on a mark leaves the keys to the motion.
+    page.evaluate("seek(0)")
+    page.locator("#marks button").first.click()
+    assert now() == (False, pytest.approx(first))
+    page.keyboard.press("Space")
+    page.wait_for_function(f"animator.playing && animator.time > {first} + 0.05")
+    page.keyboard.press("Space")
+    assert now()[0] is False
 
 
 @pytest.mark.browser

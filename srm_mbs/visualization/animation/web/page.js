@@ -243,7 +243,11 @@ function lay_out() {
     mark.style.left = `${100 * (time - about.start) / animator.duration}%`;
     mark.title = text;
     mark.setAttribute("aria-label", text);
-    mark.onclick = () => seek(time - about.start);
+    mark.onclick = (event) => {
+      seek(time - about.start);
+      // After a click of the mouse, space plays from there instead of clicking the mark again.
+      if (event.detail > 0) mark.blur();
+    };
     return mark;
   }));
   element("speed").onchange();

@@ -408,9 +408,9 @@ class Crossing:
 
     @cached_property
     def residual(self) -> float | None:
-        """Size of the residual of the closures at the critical configuration of the passage, in row
-        units (over the scene diagonal, rad): 0 to rounding at a singular one; None if none was found
-        (:mod:`srm_mbs.dynamics.singularities.critical`)."""
+        """Size of the residual of the closures at the critical configuration of the passage, in
+        row units (over the scene diagonal, rad): 0 to rounding at a singular one; None if none was
+        found (:mod:`srm_mbs.dynamics.singularities.critical`)."""
         found = self._monitor.critical(self.time)
         return None if found is None else abs(found.residual)
 

@@ -36,7 +36,7 @@ from srm_mbs.dynamics.constraints.row_algebra import (
 from srm_mbs.dynamics.constraints.structure import SMALL_REFERENCE_PIVOT
 from srm_mbs.dynamics.singularities.branches import branch_tangents
 from srm_mbs.dynamics.singularities.critical import (
-    CriticalConfiguration,
+    CriticalPlace,
     critical_configuration,
     first_step_length,
 )
@@ -169,22 +169,37 @@ def singular_values(mechanism: MechanismData) -> SingularValues:
     return SingularValues(separated_pattern(mechanism))
 
 
+def critical_near(monitor: ConstraintMonitor, t: float) -> CriticalPlace | None:
+    """The critical configuration next to the motion at t (s); None if there is none."""
+    geometry, place = monitor.geometry, monitor.place(t)
+    found = critical_configuration(
+        geometry, monitor.rank, place, CROSSING_SEARCH, jacobians=monitor.jacobians_at
+    )
+    return None if found is None else CriticalPlace(found.q, found.residual)
+
+
 class ConstraintMonitor:
     """The closures and drives along the dense output of a run.
 
-    Residuals up to ``tolerance`` (row units) count as zero.
+    Residuals up to ``tolerance`` (row units) count as zero; ``critical_of`` is
+    :func:`critical_near`, or the kernel's.
     """
 
     def __init__(
-        self, analysis: SingularityAnalysis, dense: DenseOutput, tolerance: float = 0.0
+        self,
+        analysis: SingularityAnalysis,
+        dense: DenseOutput,
+        tolerance: float = 0.0,
+        critical_of: Callable[[ConstraintMonitor, float], CriticalPlace | None] = critical_near,
     ) -> None:
+        self._critical_of = critical_of
         self._tolerance = max(tolerance, ROUNDED_RESIDUAL)
         self.geometry = analysis.geometry(analysis.q0)
         self.rank = analysis.rank
         self.analysis = analysis
         self.dense = dense
         self._values = singular_values(self.geometry.mechanism)
-        self._critical: dict[float, CriticalConfiguration | None] = {}
+        self._critical: dict[float, CriticalPlace | None] = {}
 
     def states(self, t: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """(q, v) at the times t (k,)."""
@@ -223,16 +238,10 @@ class ConstraintMonitor:
     def _jacobians(self, t: FloatArray) -> FloatArray:
         return self.dense.observables.jacobians(t, self.configurations(t))
 
-    def critical(self, t: float) -> CriticalConfiguration | None:
+    def critical(self, t: float) -> CriticalPlace | None:
         """The critical configuration next to the motion at t (s); None if there is none."""
         if t not in self._critical:
-            self._critical[t] = critical_configuration(
-                self.geometry,
-                self.rank,
-                self.place(t),
-                CROSSING_SEARCH,
-                jacobians=self._jacobians_at,
-            )
+            self._critical[t] = self._critical_of(self, t)
         return self._critical[t]
 
     def is_regular(self, t: float, around: Sequence[float]) -> bool:
@@ -244,10 +253,10 @@ class ConstraintMonitor:
             for time, (q, _) in zip((t, *around), self.states(np.array([t, *around])))
         )
         reach += max(float(np.abs(geometry.difference(q, other)).max()) for other in others)
-        step = first_step_length(geometry, self.rank, q, self._jacobians_at)
+        step = first_step_length(geometry, self.rank, q, self.jacobians_at)
         return step > BEYOND_REACH * reach
 
-    def _jacobians_at(self, places: FloatArray) -> FloatArray:
+    def jacobians_at(self, places: FloatArray) -> FloatArray:
         """As of the geometry, in one call of the observables."""
         nq = self.geometry.model.nq
         t = places[:, nq] if self.geometry.drives else np.zeros(len(places))
@@ -268,7 +277,7 @@ class ConstraintMonitor:
         found = self.critical(t)
         return found is not None and self.follows(found)
 
-    def follows(self, critical: CriticalConfiguration) -> bool:
+    def follows(self, critical: CriticalPlace) -> bool:
         """Whether the run followed the residual at a critical configuration, not counted it as
         zero."""
         return abs(critical.residual) > self._tolerance
@@ -399,18 +408,18 @@ class Crossing:
 
     @cached_property
     def residual(self) -> float | None:
-        """Residual of the closures at the critical configuration of the passage, in row units (over
-        the scene diagonal, rad): 0 to rounding at a singular configuration; None if none was found
-        (:mod:`srm_mbs.dynamics.singularities.critical`)."""
+        """Size of the residual of the closures at the critical configuration of the passage, in
+        row units (over the scene diagonal, rad): 0 to rounding at a singular one; None if none was
+        found (:mod:`srm_mbs.dynamics.singularities.critical`)."""
         found = self._monitor.critical(self.time)
-        return None if found is None else found.residual
+        return None if found is None else abs(found.residual)
 
     @property
     def by_tolerance(self) -> bool:
         """Whether the motion went straight on because the residual is below ``singular_tolerance``,
         not because it is zero."""
         residual = self.residual
-        return self.kind == "passed" and residual is not None and abs(residual) > ROUNDED_RESIDUAL
+        return self.kind == "passed" and residual is not None and residual > ROUNDED_RESIDUAL
 
     @cached_property
     def singular(self) -> SingularConfiguration | None:
@@ -867,10 +876,10 @@ def _crossings_along_curves(monitor: ConstraintMonitor, steps: StepData) -> list
         lowest = first + int(np.argmin(steps.sigmas[first:last, -1]))
         time = float(steps.times[lowest + 1])
         before, after = steps.times[lowest], steps.times[min(lowest + 2, steps.count)]
-        if monitor.is_regular(time, (before, after)):
-            continue
         critical = monitor.critical(time)
         if critical is None:
+            if monitor.is_regular(time, (before, after)):
+                continue
             # The steps around it may have their ends too far from it to lead there.
             time = _closest(monitor, np.linspace(before, after, SAMPLES))
             critical = monitor.critical(time)
@@ -922,7 +931,7 @@ def _avoided_by_steps(
             continue
         near = slice(lowest - 1, lowest + 2)
         time = monitor.minimum(times[near], values[near])
-        if monitor.is_regular(time, times[near][[0, 2]].tolist()) or not monitor.avoids(time):
+        if not monitor.avoids(time):
             continue
         found.append(crossing_at(monitor, steps, time, 0.25 * (last - first), "avoided"))
         insort(known, time)
@@ -965,6 +974,7 @@ def find_crossings(
     monitored: Callable[[], tuple[DenseOutput, float]],
     dips_of: Callable[[ButcherTableau, StepData], RecordedDips | None] = recorded_dips,
     turns_of: Callable[..., RecordedDips] = recorded_turns,
+    critical_of: Callable[[ConstraintMonitor, float], CriticalPlace | None] = critical_near,
 ) -> tuple[Crossing, ...]:
     """All crossings of a run, in order of time.
 
@@ -973,8 +983,8 @@ def find_crossings(
     monitored
         Returns its dense output, which runs that stay away from singular configurations do not
         need, and the residual (row units) up to which a critical configuration counts as singular.
-    dips_of, turns_of
-        :func:`recorded_dips` and :func:`recorded_turns`, or the kernel's.
+    dips_of, turns_of, critical_of
+        :func:`recorded_dips`, :func:`recorded_turns` and :func:`critical_near`, or the kernel's.
     """
     analysis = system.singularities
     if analysis is None or not steps.count:
@@ -983,7 +993,7 @@ def find_crossings(
     if analysis.sigma_reference >= SMALL_REFERENCE_PIVOT:
         recorded = dips_of(scheme, steps)
     else:
-        monitor = ConstraintMonitor(analysis, *monitored())
+        monitor = ConstraintMonitor(analysis, *monitored(), critical_of)
         t, _ = _recorded(scheme, steps)
         values = monitor.smallest(t)
         recorded = _dips(t, values / np.median(values), scheme.n_stages)
@@ -993,7 +1003,7 @@ def find_crossings(
         resolved = _resolved_dips(sigma) if analysis.driven else []
     if recorded is None and not steps.critical_ranges and not resolved:
         return ()
-    monitor = monitor or ConstraintMonitor(analysis, *monitored())
+    monitor = monitor or ConstraintMonitor(analysis, *monitored(), critical_of)
     searches = []
     if recorded is not None:
         if recorded.turns is None:

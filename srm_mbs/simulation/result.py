@@ -572,12 +572,13 @@ class SimulationResult(RunOutcome):
         system, scheme = self._system, self.scheme
         searches: tuple[Any, ...] = ()
         if self._by_kernel:
-            searches = kernel_steps.recorded_dips, kernel_steps.recorded_turns
+            compiled = kernel_steps.recorded_turns, kernel_steps.critical_near
+            searches = kernel_steps.recorded_dips, *compiled
             found = kernel_steps.dips_in_records(system, scheme, self._dense)
             if found == ():
                 return ()
             if found is not None:
-                searches = (lambda *_: found), kernel_steps.recorded_turns
+                searches = (lambda *_: found), *compiled
 
         def monitored() -> tuple[DenseOutput, float]:
             return self._dense, self.settings.singular_tolerance

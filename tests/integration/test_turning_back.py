@@ -212,3 +212,20 @@ def test_equal_bars_that_a_drive_turns_back_have_no_residual(
     assert "residual" not in run.message
     assert "turned back" in run.message
     assert " 0 branches" not in run.message
+
+
+@on_both
+def test_each_turn_of_a_drive_short_of_a_change_point_is_listed_as_avoided(backend: str) -> None:
+    """Next to the turn the law bends in time far more than where the search begins.  The residual
+    is quadratic in the distance that the drive leaves."""
+    residuals = []
+    for reach in (-1e-3, -1e-2):
+        motion = turning.driven(reach, 1.0)
+        run = srm.simulate(motion.mechanism, 6.0 * motion.t_end, rtol=1e-4, backend=backend)
+        turns = [passage.time / motion.t_end for passage in run.crossings]
+        np.testing.assert_allclose(turns, np.arange(6) + 0.5, atol=1e-4)
+        assert {passage.kind for passage in run.crossings} == {"avoided"}
+        sizes = [passage.residual for passage in run.crossings]
+        np.testing.assert_allclose(sizes, sizes[0], rtol=1e-6)
+        residuals.append(sizes[0])
+    assert residuals[1] == pytest.approx(100.0 * residuals[0], rel=0.01)

@@ -132,6 +132,19 @@ struct PySystem {
                                     constants);
     }
 
+    // q (nq,), t (s) and residual of srm::critical_near(), from a place q at t; None if there is none.
+    nb::object critical_near(double t, const Array& q, double time_unit, double reach,
+                             const Constants& constants) {
+        vector_of(q, system->nq, "q");
+        std::vector<double> x = to_vector(q);
+        x.resize(state_size());
+        UnitClosures closures(*system, time_unit);
+        auto found = srm::critical_near(closures, t, x, reach, constants);
+        if (!found) return nb::none();
+        found->x.resize(static_cast<std::size_t>(system->nq));
+        return nb::make_tuple(owned_array(std::move(found->x)), found->t, found->residual);
+    }
+
     // Evaluates the stage `repeats` times, to measure one evaluation in the loop.
     void repeat(double t, const Array& state, long repeats) {
         std::vector<double> rate(2 * system->nv);
@@ -652,6 +665,7 @@ void bind_system(nb::module_& m) {
         .def("terms", &PySystem::terms, nb::arg("t"), nb::arg("state"), nb::arg("threshold") = -1.0)
         .def("first_stage", &PySystem::first_stage)
         .def("motion_in_layer", &PySystem::motion_in_layer)
+        .def("critical_near", &PySystem::critical_near)
         .def("repeat", &PySystem::repeat)
         .def("repeat_tree", &PySystem::repeat_tree)
         .def("between",

@@ -72,9 +72,10 @@ namespace {
 // closures, in row units.
 class Search {
 public:
-    Search(UnitClosures& closures, const Constants& constants)
+    Search(UnitClosures& closures, double reach, const Constants& constants)
         : closures_(closures),
           constants_(constants),
+          reach_(reach),
           n_(closures.n),
           all_(closures.rows),
           rank_(closures.system.structural_rank()),
@@ -94,10 +95,15 @@ public:
         return start() && iterate(constants_.critical_decided) < constants_.critical_decided;
     }
 
+    // Brings `found` to rounding; whether the equations hold.
+    bool refine() {
+        go_back();
+        return iterate(constants_.critical_converged) < constants_.critical_accepted;
+    }
+
     // Completes `found`, to rounding, and by the Hessian there; whether the equations hold.
     bool complete() {
-        go_back();
-        if (!(iterate(constants_.critical_converged) < constants_.critical_accepted)) return false;
+        if (!refine()) return false;
         go_back();
         if (!differentiate(true)) return false;
         found.hessian = hessian_;
@@ -113,7 +119,7 @@ private:
     double iterate(double converged) {
         const int size = n_ + rank_ + 1;
         std::vector<double> value(size), matrix;
-        double best = infinity;
+        double best = infinity, last = infinity;
         for (int i = 0; i < constants_.critical_iterations; ++i) {
             fill_value(value);
             const double error = largest(value.data(), size);
@@ -126,15 +132,18 @@ private:
                 found.u = u_;
             }
             if (error <= converged) break;
-            if (last_move_ > constants_.critical_frozen && !differentiate()) return infinity;
+            const bool known = last_move_ <= constants_.critical_frozen &&
+                               (i == 0 || error < constants_.critical_converging * last);
+            if (!known && !differentiate()) return infinity;
+            last = error;
             fill_matrix(matrix);
             for (double& v : value) v = -v;
             if (!solve(matrix, value)) return infinity;
             last_move_ = largest(value.data(), n_);
-            if (!(last_move_ < constants_.critical_reach)) return infinity;
+            if (!(last_move_ < reach_)) return infinity;
             closures_.move(value.data(), x_, time_);
             add(1.0, value.data(), moved_.data(), n_);
-            if (!(largest(moved_.data(), n_) < constants_.critical_reach)) return infinity;
+            if (!(largest(moved_.data(), n_) < reach_)) return infinity;
             add(1.0, value.data() + n_, u_.data(), rank_);
             const double length = norm(u_.data(), rank_);
             for (double& u : u_) u /= length;
@@ -278,6 +287,7 @@ private:
 
     UnitClosures& closures_;
     const Constants& constants_;
+    const double reach_;
     const int n_, all_, rank_;
     std::vector<double> g_, G_, u_, hessian_, x_, moved_;
     std::vector<double> ahead_, behind_, move_, there_;  // of differentiate()
@@ -288,6 +298,14 @@ private:
 
 }  // namespace
 
+std::optional<CriticalConfiguration> critical_near(UnitClosures& closures, double t,
+                                                   const std::vector<double>& x, double reach,
+                                                   const Constants& constants) {
+    Search search(closures, reach, constants);
+    if (!search.run(x, t) || !search.refine()) return {};
+    return std::move(search.found);
+}
+
 std::optional<CriticalConfiguration> critical_of_passage(UnitClosures& closures, double t,
                                                          const double* begin, const double* rate,
                                                          double zero, const Constants& constants) {
@@ -297,7 +315,7 @@ std::optional<CriticalConfiguration> critical_of_passage(UnitClosures& closures,
     std::vector<double> move(2 * nv, 0.0), place(nx), away(closures.n);
     for (int i = 0; i < nv; ++i) move[i] = ahead * (rate[i] + 0.5 * ahead * rate[nv + i]);
     system.retract(begin, move.data(), place.data());
-    Search search(closures, constants);
+    Search search(closures, constants.critical_reach, constants);
     if (!search.run(place, zero)) return {};
     CriticalConfiguration& found = search.found;
     const auto distance = [&](const std::vector<double>& x) {

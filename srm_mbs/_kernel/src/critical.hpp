@@ -46,6 +46,12 @@ struct CriticalConfiguration {
     bool passed;                  // the straight motion leads past it
 };
 
+// The critical configuration within `reach` (units) of a place x (nx,) at t (s), of which velocities
+// do not matter, to rounding and without its Hessian; none if there is none.
+std::optional<CriticalConfiguration> critical_near(UnitClosures& closures, double t,
+                                                   const std::vector<double>& x, double reach,
+                                                   const Constants& constants);
+
 // The critical configuration next to a motion at `zero` (s), from the state `begin` at t with the
 // tangent rate `rate`; none if there is none.
 std::optional<CriticalConfiguration> critical_of_passage(UnitClosures& closures, double t,

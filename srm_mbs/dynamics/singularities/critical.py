@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,6 +40,9 @@ ACCEPTED = 1e-11
 """Size of them from which the search has failed."""
 FROZEN = 1e-2
 """Newton step (units) from which on the Hessian is not evaluated again."""
+CONVERGING = 0.5
+"""Ratio of the sizes of the equations in two iterations from which it is, too: next to a turn of a
+drive the curvature by time is far from that where the search began."""
 APPROACH = 0.5
 """Distance from a known critical configuration after Newton's first step, over that before it,
 below which the search leads there."""
@@ -51,6 +55,21 @@ LARGEST_DEVIATION = 0.5
 which it is not beside that one."""
 DEFINITE = 1e-3
 """Ratio of the two curvatures of a saddle below which branches are almost tangent."""
+
+
+class CriticalPlace(NamedTuple):
+    """Where the closures are critical, and how nearly they are singular there.
+
+    Attributes
+    ----------
+    q : (nq,)
+        The configuration, as the geometry takes it.
+    residual
+        As of :class:`CriticalConfiguration`; its sign is that of u, which is arbitrary.
+    """
+
+    q: FloatArray
+    residual: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,14 +245,15 @@ def critical_configuration(
             turned = one.in_turns_of(q)
             if turned is not None:
                 return turned
-    x, moved, best = q, np.inf, np.inf
+    x, moved, best, last = q, np.inf, np.inf, np.inf
     found: CriticalConfiguration | None = None
     for _ in range(ITERATIONS):
         error = float(np.abs(_equations(g, G, u, delta)).max())
         if not error < best and error < ACCEPTED:
             break
-        if moved > FROZEN:
+        if moved > FROZEN or not error < CONVERGING * last:
             H = _hessian(geometry, (u @ rows) / size, x, jacobians, G.T @ u)
+        last = error
         if error < best:
             best, found = error, CriticalConfiguration(geometry, x, rows, u, delta, H)
             decided = error <= DECIDED and abs(found.residual) <= singular_to

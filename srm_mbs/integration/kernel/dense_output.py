@@ -14,7 +14,8 @@ from srm_mbs.dynamics.constraints.geometry import geometry_of
 from srm_mbs.dynamics.constraints.row_algebra import COMPILED_ABOVE
 from srm_mbs.dynamics.constraints.structure import SMALL_REFERENCE_PIVOT, structure_of
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
-from srm_mbs.integration import singular_passages
+from srm_mbs.dynamics.singularities.critical import CriticalPlace
+from srm_mbs.integration import critical_passages, singular_passages
 from srm_mbs.integration.dense_output import DenseOutput, StepData
 from srm_mbs.integration.generated.code import code_of_record
 from srm_mbs.integration.kernel import marshalling
@@ -168,6 +169,25 @@ class CompiledDenseOutput(DenseOutput):
             return None
         return dips.at_no_turn(others, [Turn(*turn) for turn in turns])
 
+    def critical_near(self, monitor: ConstraintMonitor, t: float) -> CriticalPlace | None:
+        """:func:`~srm_mbs.integration.singular_passages.critical_near` of the run."""
+        geometry, system = monitor.geometry, self._mechanism_system
+        q = monitor.configurations(np.array([t]))[0]
+        reach, constants = singular_passages.CROSSING_SEARCH, marshalling.constants()
+        given = t, q, float(geometry.unit[-1]), reach, constants
+        try:
+            if self.kernel_system is not None:
+                found = self.kernel_system.critical_near(*given)
+            else:
+                with workspace(system) as kernel_system:
+                    found = kernel_system.critical_near(*given)
+        except ArithmeticError:
+            return singular_passages.critical_near(monitor, t)
+        if found is None:
+            return None
+        place, time, residual = found
+        return CriticalPlace(geometry.at(place, time), residual)
+
     @cached_property
     def _by_reference(self) -> bool:
         """Whether only the reference can evaluate it."""
@@ -255,6 +275,16 @@ def recorded_turns(
         if found is not None:
             return found
     return singular_passages.recorded_turns(monitor, scheme, steps, dips)
+
+
+def critical_near(monitor: ConstraintMonitor, t: float) -> CriticalPlace | None:
+    """As :func:`srm_mbs.integration.singular_passages.critical_near`; that itself for mechanisms
+    with many coordinates, of which it has faster algebra."""
+    dense = monitor.dense
+    large = monitor.geometry.model.nv > critical_passages.LARGEST
+    if large or not isinstance(dense, CompiledDenseOutput):
+        return singular_passages.critical_near(monitor, t)
+    return dense.critical_near(monitor, t)
 
 
 def dips_in_records(

@@ -177,6 +177,7 @@ def constants() -> Any:
         critical_decided=critical.DECIDED,
         critical_accepted=critical.ACCEPTED,
         critical_frozen=critical.FROZEN,
+        critical_converging=critical.CONVERGING,
         critical_ridge=critical.RIDGE,
         critical_reach=critical_passages.SEARCH,
         critical_farthest=critical_passages.FARTHEST,

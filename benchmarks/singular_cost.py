@@ -119,7 +119,7 @@ def nothing_for_singular_configurations() -> Iterator[None]:
         return placed_control(system, options._replace(placement="off"), first_step)
 
     def start(
-        system: Any, method: Any, t: float, state: Any, norm: Any, *_: Any
+        system: Any, method: Any, t: float, state: Any, norm: Any, *_: Any, **__: Any
     ) -> IntegratorState:
         return method.start(system, t, state, norm)  # type: ignore[no-any-return]
 

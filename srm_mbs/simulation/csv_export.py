@@ -97,7 +97,7 @@ def write_table(columns: Mapping[str, NDArray[Any]], path: str | Path | io.TextI
     OSError
         If the file cannot be written.
     """
-    if not isinstance(path, str | Path):
+    if isinstance(path, io.TextIOBase):
         _write_rows(columns, path)
         return
     with writing(path) as file:

@@ -142,6 +142,8 @@ LARGEST_PROJECTION = 1e-4
 """Largest motion (units) onto the closures of another mechanism: more is an inconsistent state."""
 CLOSED_ROUNDING = 1e-13
 """Closure error that is rounding, in scaled rows, and over 1 + |v| that of rates."""
+CLOSED_ON_CURVE = 1e-9
+"""The same on the curve past a critical configuration; next to a narrow layer it is far closer."""
 NEGLIGIBLE_REST = 1e-12
 """Part of the run too short for another segment."""
 
@@ -496,8 +498,10 @@ def _rounding(event: _RunEvent, solution: SimulationResult) -> float:
     return HELD_EVENT_ROUNDING * max(abs(event.value(t, x)) for t, x in zip(solution.t, states))
 
 
-def _closed(system: OpenSystem | ClosedSystem | Evaluator, t: float, x: FloatArray) -> bool:
-    """Whether ``x`` is on the closures to rounding.
+def _closed(
+    system: OpenSystem | ClosedSystem | Evaluator, t: float, x: FloatArray, largest: float
+) -> bool:
+    """Whether ``x`` is on the closures, to the ``largest`` error, which is that of rounding for most.
 
     A projection would then gain nothing, and next to a singular configuration it would move ``x``
     off its branch by rounding over sigma.
@@ -505,7 +509,7 @@ def _closed(system: OpenSystem | ClosedSystem | Evaluator, t: float, x: FloatArr
     error, rate = system.largest_residuals(x, t)
     # Of a list: it is short, and NumPy takes five times as long.
     speed = max(map(abs, x[system.nq :].tolist()))
-    return bool(error < CLOSED_ROUNDING and rate < CLOSED_ROUNDING * (1.0 + speed))
+    return bool(error < largest and rate < largest * (1.0 + speed))
 
 
 def _after_actions(
@@ -533,8 +537,9 @@ def _after_actions(
     before = x = segment.last_state
     try:
         # The dense output is on the closures within the tolerance only.  On a curve that turns
-        # beside a critical configuration a projection may lead to the other one there.
-        if not end.on_curve and not _closed(known, t, x):
+        # beside a critical configuration a projection may lead to the other one there, unless the
+        # layer is wide, where the curve is on the closures within the tolerance, too.
+        if not _closed(known, t, x, CLOSED_ON_CURVE if end.on_curve else CLOSED_ROUNDING):
             x = onto_closed_branch(
                 part.system if controller is None else make_system(mechanism), t, x
             )

@@ -501,7 +501,7 @@ def _rounding(event: _RunEvent, solution: SimulationResult) -> float:
 def _closed(
     system: OpenSystem | ClosedSystem | Evaluator, t: float, x: FloatArray, largest: float
 ) -> bool:
-    """Whether ``x`` is on the closures, to the ``largest`` error, which is that of rounding for most.
+    """Whether ``x`` is on the closures, up to the ``largest`` error: that of rounding for most.
 
     A projection would then gain nothing, and next to a singular configuration it would move ``x``
     off its branch by rounding over sigma.

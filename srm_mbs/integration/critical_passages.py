@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._typing import FloatArray
+from srm_mbs.dynamics.constraints.structure import structure_of
 from srm_mbs.dynamics.singularities.critical import (
     LARGEST_DEVIATION,
     CriticalConfiguration,
@@ -38,6 +39,7 @@ from srm_mbs.integration.methods.base import ErrorNorm, Method, StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import is_split
 from srm_mbs.model.lazy import cached_property
+from srm_mbs.model.mechanism import MechanismData
 
 SEARCH = 0.6
 """Distance (rad, scene diagonals) from the predicted passage within which its critical
@@ -691,11 +693,11 @@ def examined_passages(
     return CriticalPassages(branch_system, method.scheme, norm, tolerance)
 
 
-def step_from_layer(v: FloatArray, unit: FloatArray) -> float:
-    """The first step (s) after a motion that starts in a layer with the rates ``v`` (nv,): a part
-    of the time in which it leaves that, as it may turn back soon.  ``unit`` (nv,): of the
-    coordinates."""
-    return FIRST_PART * START_REACH / float(np.abs(v / unit).max())
+def step_from_layer(mechanism: MechanismData, state: FloatArray) -> float:
+    """The first step (s) after a motion that starts in a layer with ``state`` (nx,): a part of the
+    time in which it leaves that, as it may turn back soon."""
+    rates = state[mechanism.model.nq :] / structure_of(mechanism).units.coordinate
+    return FIRST_PART * START_REACH / float(np.abs(rates).max())
 
 
 def layer_motion(

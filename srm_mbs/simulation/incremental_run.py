@@ -100,9 +100,7 @@ class IncrementalRun(ABC):
             self._evaluator, self.method, t, state, self.norm, smooth_until, layers=layers
         )
         if layers is not None and layers.under_way:
-            first = step_from_layer(
-                self.system.split(state)[1], self.system.mechanism.structure.units.coordinate
-            )
+            first = step_from_layer(self.system.mechanism, state)
         else:
             order = self.method.scheme.controller_order or 1
             first = initial_step(self._evaluator, state, memory, self.norm, span, order, t)

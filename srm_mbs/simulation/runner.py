@@ -653,9 +653,7 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
         memory = start(system, method, t0, state, norm, handler.end, layers=passages)
         memory.stiff = problem.stiff
         if passages is not None and passages.under_way:
-            problem.last_step = step_from_layer(
-                system.split(state)[1], problem.mechanism.structure.units.coordinate
-            )
+            problem.last_step = step_from_layer(problem.mechanism, state)
         found = integrate_steps(
             system,
             options,
@@ -677,9 +675,7 @@ def _integrate(problem: Problem, kernel_system: Any) -> tuple[RunRecord, Counter
     first = first_stage(evaluator, method, t0, state, norm, handler.end, problem.stiff, layers)
     motion = None if layers is None else layers.motion
     if motion is not None:
-        problem.last_step = step_from_layer(
-            system.split(state)[1], problem.mechanism.structure.units.coordinate
-        )
+        problem.last_step = step_from_layer(problem.mechanism, state)
     given = options.first_step or problem.last_step or None
     try:
         run = _compiled_run(problem, kernel_system, first, given, handler)

@@ -173,8 +173,8 @@ class CompiledDenseOutput(DenseOutput):
         """:func:`~srm_mbs.integration.singular_passages.critical_near` of the run."""
         geometry, system = monitor.geometry, self._mechanism_system
         q = monitor.configurations(np.array([t]))[0]
-        reach, constants = singular_passages.CROSSING_SEARCH, marshalling.constants()
-        given = t, q, float(geometry.unit[-1]), reach, constants
+        reach = singular_passages.CROSSING_SEARCH
+        given = t, q, float(geometry.unit[-1]), reach, marshalling.CONSTANTS
         try:
             if self.kernel_system is not None:
                 found = self.kernel_system.critical_near(*given)

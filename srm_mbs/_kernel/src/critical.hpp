@@ -43,7 +43,7 @@ struct CriticalConfiguration {
     std::vector<double> u;        // (rank,), of unit length
     std::vector<double> hessian;  // (n, n), of u . g
     double residual;
-    bool passed;                  // the straight motion leads past it
+    bool passed = false;          // the straight motion leads past it
 };
 
 // The critical configuration within `reach` (units) of a place x (nx,) at t (s), of which velocities

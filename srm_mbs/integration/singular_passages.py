@@ -169,6 +169,14 @@ def singular_values(mechanism: MechanismData) -> SingularValues:
     return SingularValues(separated_pattern(mechanism))
 
 
+@per_model
+def turning_columns(mechanism: MechanismData) -> list[int]:
+    """The coordinates, of nv, that the rows of closures and drives depend on: of a motion that
+    turns back next to a singular configuration they change their sign."""
+    used = np.logical_or.reduce(separated_pattern(mechanism), axis=0)
+    return np.flatnonzero(used[: mechanism.model.nv]).tolist()
+
+
 def critical_near(monitor: ConstraintMonitor, t: float) -> CriticalPlace | None:
     """The critical configuration next to the motion at t (s); None if there is none."""
     geometry, place = monitor.geometry, monitor.place(t)
@@ -193,7 +201,7 @@ class ConstraintMonitor:
         critical_of: Callable[[ConstraintMonitor, float], CriticalPlace | None] = critical_near,
     ) -> None:
         self._critical_of = critical_of
-        self._tolerance = max(tolerance, ROUNDED_RESIDUAL)
+        self.tolerance = max(tolerance, ROUNDED_RESIDUAL)
         self.geometry = analysis.geometry(analysis.q0)
         self.rank = analysis.rank
         self.analysis = analysis
@@ -267,7 +275,7 @@ class ConstraintMonitor:
         """The critical configuration next to the motion at t (s) whose residual counts as zero
         without being it; None if there is none."""
         found = self.critical(t)
-        if found is None or not ROUNDED_RESIDUAL < abs(found.residual) <= self._tolerance:
+        if found is None or not ROUNDED_RESIDUAL < abs(found.residual) <= self.tolerance:
             return None
         return found.q
 
@@ -280,7 +288,7 @@ class ConstraintMonitor:
     def follows(self, critical: CriticalPlace) -> bool:
         """Whether the run followed the residual at a critical configuration, not counted it as
         zero."""
-        return abs(critical.residual) > self._tolerance
+        return abs(critical.residual) > self.tolerance
 
     def together(self, searches: Sequence[Search[T]]) -> list[T]:
         """Results of ``searches`` that do not depend on each other.
@@ -631,11 +639,18 @@ class RecordedDips:
     turns
         Turns beyond singular configurations, which are not among the minima; None before
         :func:`recorded_turns`.
+    at_turns
+        As ``samples``, of those at turns, which are no longer among the minima.
     """
 
     samples: IndexArray
     tops: IndexArray
     turns: Sequence[Turn] | None = None
+    at_turns: Sequence[Sequence[int]] = ()
+
+    def __bool__(self) -> bool:
+        """Whether there is something to search."""
+        return bool(len(self.tops) or self.turns)
 
     def free(self, count: int) -> IndexArray:
         """First sample and that after the last (n, 2), of ``count``, of those around each minimum
@@ -646,7 +661,8 @@ class RecordedDips:
 
     def at_no_turn(self, others: IndexArray, turns: Sequence[Turn]) -> RecordedDips:
         """The minima ``others`` (k,), and the ``turns`` found among the rest."""
-        return RecordedDips(self.samples[others], self.tops[others], turns)
+        at_turns = np.delete(self.samples, others, axis=0).tolist()
+        return RecordedDips(self.samples[others], self.tops[others], turns, at_turns)
 
 
 def recorded_dips(scheme: ButcherTableau, steps: StepData) -> RecordedDips | None:
@@ -711,10 +727,11 @@ def _dips_in(
 def _reversals(
     monitor: ConstraintMonitor, steps: StepData, first: IndexArray, last: IndexArray
 ) -> tuple[IndexArray, FloatArray, FloatArray]:
-    """In which of the ranges of steps from ``first`` to ``last`` (n,) all rates change their sign,
-    once: their indices (k,), and when (k,) s and where (k, nq)."""
+    """In which of the ranges of steps from ``first`` to ``last`` (n,) all rates that the rows
+    depend on change their sign, once: their indices (k,), and when (k,) s and where (k, nq)."""
     split, unit = monitor.analysis.split, monitor.geometry.coordinate_unit
-    rates = split(steps.states)[1] / unit
+    columns = turning_columns(monitor.geometry.mechanism)
+    rates = (split(steps.states)[1] / unit)[:, columns]
     reverses = np.flatnonzero((rates[:-1] * rates[1:]).sum(axis=1) < 0.0)
     place = np.searchsorted(reverses, first)
     once = np.flatnonzero(np.searchsorted(reverses, last, side="right") == place + 1)
@@ -729,18 +746,22 @@ def _reversals(
     t = start - before / size * (end - start)
     for _ in range(REVERSAL_STEPS):
         _, v = split(monitor.dense(t))
-        t = np.clip(t - (v / unit * change).sum(axis=1) / size * (end - start), start, end)
+        along = ((v / unit)[:, columns] * change).sum(axis=1)
+        t = np.clip(t - along / size * (end - start), start, end)
     return once[straight], t, monitor.configurations(t)
 
 
 def recorded_turns(
     monitor: ConstraintMonitor, scheme: ButcherTableau, steps: StepData, dips: RecordedDips
 ) -> RecordedDips:
-    """The minima ``dips`` without those at turns, where all rates change their sign and the motion
-    certainly did not touch the singular configuration; and those of the turns that lie beyond it,
-    not before."""
+    """The minima ``dips`` without those at turns, where all rates change their sign that the rows
+    depend on, and the motion certainly did not touch the singular configuration; and those of the
+    turns that lie beyond it, not before.
+
+    Of driven mechanisms the turns are left among the minima that lie beyond it, or next to a
+    critical configuration of which the motion followed the residual."""
     every = np.arange(len(dips.tops))
-    if monitor.geometry.drives or np.logical_or.reduce(steps.stiff):
+    if np.logical_or.reduce(steps.stiff):
         return dips.at_no_turn(every, ())
     columns = scheme.member(False).distinct
     stages, samples = len(columns), dips.samples
@@ -773,14 +794,24 @@ def recorded_turns(
     k = monitor.rank - 1
     values = np.einsum("ni,snij,nj->sn", left[:, :, k], G, right[:, k])
     before, value, after = np.abs(values)
-    # The largest value of the window follows from the recorded sigmas.
+    # The largest value of the window follows from the recorded sigmas, about.
     at = np.maximum(tops - 1, 0)
-    untouched = UNTOUCHED_VALUE * steps.sigmas[at // stages, columns[at % stages]]
+    step, column = at // stages, columns[at % stages]
+    untouched = UNTOUCHED_VALUE * steps.sigmas[step, column]
     certain = (sizes[:, :k].min(axis=1, initial=np.inf) > VANISHING_TOGETHER * value) & (
         values[0] * values[2] > 0.0
     )
+    far = certain.copy()
     for side, recorded_side in ((before, steps.sigmas[first, 0]), (after, steps.sigmas[last, -1])):
-        certain &= value * recorded_side > untouched * side
+        far &= value * recorded_side > untouched * side
+    close = np.flatnonzero(certain & ~far)
+    lengths = np.where(tops > 0, np.diff(steps.times)[step], 0.0)
+    t_top = steps.times[step] + scheme.member(False).abscissae[column] * lengths
+    certain[close] = value[close] > TOUCHING_VALUE * monitor.smallest(t_top[close])
+    if monitor.geometry.drives:
+        short = certain & (values[0] > 0.0)
+        certain[short] = [not monitor.avoids(time) for time in times[1, short].tolist()]
+        certain &= short
     taken: set[int] = set()
     turns = []
     for i in np.flatnonzero(certain).tolist():  # those of several minima first
@@ -849,7 +880,7 @@ def _rank_loss_cosine(
             return None
         G = geometry.normalised(found)
     # Rows that are zero in all of them have no part.
-    active = active_rows(G) | active_rows(G_before) | active_rows(G_after)
+    active = active_rows(np.array([G, G_before, G_after])).any(axis=0)
     if not active.all():
         G, G_before, G_after = (rows[active] for rows in (G, G_before, G_after))
     left, right = monitor.near_null_spaces(G, active)
@@ -896,10 +927,13 @@ def _crossings_along_curves(monitor: ConstraintMonitor, steps: StepData) -> list
     return found
 
 
-def _resolved_dips(sigma: FloatArray) -> list[int]:
-    """Indices of the minima of the recorded ``sigma`` (k,) below AVOIDED_SIGMA."""
+def _resolved_dips(sigma: FloatArray, dips: RecordedDips | None) -> list[int]:
+    """Indices of the minima of the recorded ``sigma`` (k,) below AVOIDED_SIGMA, but for those of
+    ``dips`` at turns."""
     inner = sigma[1:-1]
     lowest = (inner <= sigma[:-2]) & (inner < sigma[2:]) & (inner < AVOIDED_SIGMA)
+    for first, _, last in () if dips is None else dips.at_turns:
+        lowest[first : last - 1] = False
     return (np.flatnonzero(lowest) + 1).tolist()
 
 
@@ -997,17 +1031,18 @@ def find_crossings(
         t, _ = _recorded(scheme, steps)
         values = monitor.smallest(t)
         recorded = _dips(t, values / np.median(values), scheme.n_stages)
+    if recorded is not None and recorded.turns is None:
+        monitor = monitor or ConstraintMonitor(analysis, *monitored(), critical_of)
+        recorded = turns_of(monitor, scheme, steps, recorded)
     resolved: list[int] = []
-    if recorded is not None or analysis.driven:
+    if recorded or analysis.driven:
         t, sigma = _recorded(scheme, steps)
-        resolved = _resolved_dips(sigma) if analysis.driven else []
-    if recorded is None and not steps.critical_ranges and not resolved:
+        resolved = _resolved_dips(sigma, recorded) if analysis.driven else []
+    if not (recorded or steps.critical_ranges or resolved):
         return ()
     monitor = monitor or ConstraintMonitor(analysis, *monitored(), critical_of)
     searches = []
-    if recorded is not None:
-        if recorded.turns is None:
-            recorded = turns_of(monitor, scheme, steps, recorded)
+    if recorded:
         searches = [
             _crossings_at(monitor, steps, t, sigma, dip, top, slice(*free))
             for dip, top, free in zip(
@@ -1226,7 +1261,7 @@ def _sign_changes(
         ]
     )
     G = monitor.normalised(np.concatenate([[time], times]))
-    active = np.logical_or.reduce([active_rows(rows) for rows in G])
+    active = active_rows(G).any(axis=0)
     left, right = monitor.near_null_spaces(G[0, active], active)
     parts = (left.T @ G[1:, active] @ right).reshape(len(times), -1)
     reference = parts[times.searchsorted(t[after])]

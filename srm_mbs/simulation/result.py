@@ -574,7 +574,8 @@ class SimulationResult(RunOutcome):
         if self._by_kernel:
             compiled = kernel_steps.recorded_turns, kernel_steps.critical_near
             searches = kernel_steps.recorded_dips, *compiled
-            found = kernel_steps.dips_in_records(system, scheme, self._dense)
+            tolerance = self.settings.singular_tolerance
+            found = kernel_steps.dips_in_records(system, scheme, self._dense, tolerance)
             if found == ():
                 return ()
             if found is not None:

@@ -135,31 +135,66 @@ def test_the_kernel_finds_the_same_minima_of_sigma(tableau: str) -> None:
     assert found == {True, False}
 
 
+def beside_change_points(family: str, reach: float) -> srm.Mechanism:
+    motion = turning.lifted(reach) if family == "lifted" else getattr(turning, family)(reach, 1.0)
+    return motion.mechanism
+
+
 @needs_kernel
 @pytest.mark.parametrize("tableau", ["dopr54", "dop853"])
-@pytest.mark.parametrize("reach", [1e-4, 1e-5, -1e-4, -1e-2])
+@pytest.mark.parametrize(
+    ("family", "reach"),
+    [
+        *(("lifted", reach) for reach in (1e-4, 1e-5, -1e-7, -1e-4, -1e-2)),
+        ("driven", -1e-5),
+        ("driven_with_pendulum", -1e-5),
+    ],
+)
 def test_the_kernel_tells_turns_beside_singular_configurations_as_the_reference(
-    reach: float, tableau: str
+    family: str, reach: float, tableau: str
 ) -> None:
-    mechanism = turning.lifted(reach).mechanism
-    solution = srm.simulate(mechanism, 6.0, rtol=1e-7, tableau=tableau)
+    solution = srm.simulate(beside_change_points(family, reach), 6.0, rtol=1e-7, tableau=tableau)
     scheme, steps, analysis = solution.scheme, solution.steps, solution.system.singularities
     dips = crossings_module.recorded_dips(scheme, steps)
     assert analysis is not None
     assert dips is not None
     dense = kernel_steps.dense_output(solution.system, scheme, steps, "kernel")
-    monitor = ConstraintMonitor(analysis, dense)
-    told = dense.turns(scheme, dips)  # type: ignore[attr-defined]
+    monitor = ConstraintMonitor(analysis, dense, solution.settings.singular_tolerance)
+    told = dense.turns(scheme, dips, monitor.tolerance)  # type: ignore[attr-defined]
     expected = crossings_module.recorded_turns(monitor, scheme, steps, dips)
     assert len(told.samples) < len(dips.samples)
     np.testing.assert_array_equal(told.samples, expected.samples)
     np.testing.assert_array_equal(told.tops, expected.tops)
+    assert told.at_turns == expected.at_turns
     assert expected.turns is not None
     assert bool(expected.turns) == (reach > 0.0)
     for own, other in zip(told.turns, expected.turns, strict=True):
         assert own.top == other.top
         np.testing.assert_allclose(own.times, other.times, rtol=0.0, atol=1e-9)
         np.testing.assert_allclose(own.values, other.values, rtol=1e-6)
+
+
+@needs_kernel
+@pytest.mark.parametrize("reach", [-1e-3, -1e-4, 1e-3])
+def test_turns_of_a_drive_that_avoid_or_pass_a_configuration_are_searched(reach: float) -> None:
+    solution = srm.simulate(beside_change_points("driven", reach), 6.0, rtol=1e-7)
+    scheme, steps = solution.scheme, solution.steps
+    dips = crossings_module.recorded_dips(scheme, steps)
+    assert dips is not None
+    told = solution._dense.turns(scheme, dips, 1e-9)  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(told.samples, dips.samples)
+    assert (told.turns, told.at_turns) == ([], [])
+
+
+@pytest.mark.parametrize("family", ["driven", "driven_with_pendulum"])
+@pytest.mark.parametrize(("tolerance", "listed"), [(1e-9, 0), (0.0, 2)])
+def test_turns_of_a_drive_are_listed_where_the_run_followed_the_residual(
+    family: str, tolerance: float, listed: int
+) -> None:
+    # The drive turns at t = pi and 3 pi, 1e-5 rad before the change point: the residual is 4e-11.
+    mechanism = beside_change_points(family, -1e-5)
+    solution = srm.simulate(mechanism, 12.0, rtol=1e-7, singular_tolerance=tolerance)
+    assert [crossing.kind for crossing in solution.crossings] == ["avoided"] * listed
 
 
 def test_a_start_on_a_singular_configuration_is_no_passage() -> None:

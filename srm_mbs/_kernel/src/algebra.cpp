@@ -17,12 +17,14 @@ constexpr int looked_at_each = 3;
 // Length of the next vector, over the largest diagonal entry so far, from which there is none:
 // rounding is all that is left of it.
 constexpr double exhausted = 1e-12;
+// Random part of a first vector that is about known: vectors that have come before it are in it.
+constexpr double unknown = 1e-2;
 
 }  // namespace
 
 // Lanczos' iteration for the largest eigenvalue, the inverse square of the smallest singular value,
 // of (W^T W)^-1, each vector orthogonalised twice against all.
-double Algebra::weakest() {
+double Algebra::weakest(std::vector<double>* start) {
     const int n = rows_;
     std::vector<std::vector<double>> basis;
     std::vector<double> diagonal, beside, next(n);
@@ -30,6 +32,10 @@ double Algebra::weakest() {
     std::normal_distribution<double> normal;
     Eigen::SelfAdjointEigenSolver<Eigen::MatrixXd> eigen;
     for (double& x : next) x = normal(generator);
+    if (start && !start->empty()) {
+        const double part = unknown / norm(next.data(), n);
+        for (int i = 0; i < n; ++i) next[i] = part * next[i] + (*start)[i];
+    }
     double length = norm(next.data(), n), largest = 0.0, found = 0.0;
     for (int k = 0; k < n; ++k) {
         basis.emplace_back(next);
@@ -51,7 +57,13 @@ double Algebra::weakest() {
             // B. N. Parlett, The Symmetric Eigenvalue Problem, SIAM 1998, 11.7.
             const double gap = k > 0 ? found - eigen.eigenvalues()[k - 1] : 0.0;
             const double error = gap > residual ? residual * residual / gap : residual;
-            if (last || !(error > std::numeric_limits<double>::epsilon() * found)) break;
+            if (last || !(error > std::numeric_limits<double>::epsilon() * found)) {
+                if (!start) break;
+                start->assign(n, 0.0);
+                for (int i = 0; i <= k; ++i)
+                    add(eigen.eigenvectors()(i, k), basis[i].data(), start->data(), n);
+                break;
+            }
         }
         beside.push_back(length);
     }

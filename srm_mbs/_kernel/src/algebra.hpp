@@ -87,15 +87,15 @@ public:
     }
 
     // Row j of G (nv,), cleared; then the smallest singular value of all rows, however small their
-    // pivots are, 0 if one of them is zero.
+    // pivots are, 0 if one of them is zero.  start: as of weakest().
     double* row(int j) { return projection_->column(j); }
-    double smallest_of_rows() {
+    double smallest_of_rows(std::vector<double>* start = nullptr) {
         factor_columns(-1.0);
         const auto& pivots = projection_->pivots();
         if (std::any_of(pivots.begin(), pivots.end(), [](double p) { return !(p > 0.0); }))
             return 0.0;
         projection_->rank = rows_;
-        return weakest();
+        return weakest(start);
     }
 
     // Factorises the rows that were written, and solves for the shortest x (nv,) with G x = g.
@@ -146,7 +146,8 @@ private:
         }
     }
 
-    double weakest();
+    // start (rows,): about the left singular vector, empty if it is not known, and then that found.
+    double weakest(std::vector<double>* start = nullptr);
 
     static std::vector<double> checked(const Array& values, int size) {
         if (values.ndim() != 1 || static_cast<int>(values.size()) != size)

@@ -206,18 +206,20 @@ struct PyDense {
     }
 
     // Of the dips (n, 3) and tops (n,) of dips_of(): numbers of those at no turn, and the turns
-    // beyond singular configurations.
+    // beyond singular configurations.  tolerance: as of recorded_turns().
     nb::tuple turns(nb::handle owner, nb::handle rows_owner, const SeparatedRows& rows,
                     const TurnSearch& search, const DipSearch& dips, const Indices& samples,
-                    const Indices& tops) {
+                    const Indices& tops, double tolerance, const Constants& constants) {
         System &system = system_in(owner), &all_rows = system_in(rows_owner);
         const std::size_t n = tops.size(), count = rows.supports.size();
         if (samples.ndim() != 2 || samples.shape(0) != n || samples.shape(1) != 3)
             throw nb::value_error("dips and tops have other shapes");
         expect_size("rows", count, static_cast<std::size_t>(all_rows.rows()));
-        expect_size("factors", rows.factors.size(), count * system.nv);
+        const int width = system.nv + (system.driven() ? 1 : 0);
+        expect_size("factors", rows.factors.size(), count * width);
         expect_size("unit", search.unit.size(), static_cast<std::size_t>(system.nv));
-        expect_within("rank", search.rank, 1, std::min<long>(system.nv, static_cast<long>(count)));
+        expect_within("columns", search.columns, 0, system.nv - 1);
+        expect_within("rank", search.rank, 1, std::min<long>(width, static_cast<long>(count)));
         expect_within("columns", dips.columns, 0, dense.sigma_width() - 1);
         const long last = dense.steps().count * static_cast<long>(dips.columns.size());
         SigmaDips recorded;
@@ -229,7 +231,8 @@ struct PyDense {
             recorded.dips.push_back({dip[0], dip[1], dip[2]});
             recorded.tops.push_back(tops.data()[i]);
         }
-        const Turns found = recorded_turns(search, rows, all_rows, dips, recorded, dense, system);
+        const Turns found = recorded_turns(search, rows, all_rows, dips, recorded, dense, system,
+                                           tolerance, constants);
         nb::list beyond;
         for (const Turn& turn : found.beyond)
             beyond.append(nb::make_tuple(turn.times, turn.values, turn.top));

@@ -443,10 +443,12 @@ struct PySystem {
             static_cast<int>(rows.active.size()) != algebra.rows() ||
             static_cast<int>(width) != algebra.columns())
             throw nb::value_error("the rows are not those of the system and of the algebra");
-        std::vector<double> out(n), G(all * width);
+        // From one state to the next, often close to it, the singular vector changes little.
+        std::vector<double> out(n), G(all * width), left_vector;
         // With the interpreter's lock: threads may share the algebra.
         for (std::size_t i = 0; i < n; ++i)
-            out[i] = rows.smallest(*system, algebra, t.data()[i], q.data() + i * system->nq, G);
+            out[i] = rows.smallest(*system, algebra, t.data()[i], q.data() + i * system->nq, G,
+                                   &left_vector);
         return owned_array(std::move(out));
     }
 

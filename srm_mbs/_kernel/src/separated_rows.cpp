@@ -42,7 +42,7 @@ void SeparatedRows::write(System& system, double t, const double* q,
 }
 
 double SeparatedRows::smallest(System& system, Algebra& algebra, double t, const double* q,
-                               std::vector<double>& G) const {
+                               std::vector<double>& G, std::vector<double>* left_vector) const {
     const std::size_t rows = supports.size(), n = factors.size() / rows;
     write(system, t, q, G);
     std::size_t next = 0;
@@ -60,7 +60,7 @@ double SeparatedRows::smallest(System& system, Algebra& algebra, double t, const
             return not_a_number;
         next += used;
     }
-    return algebra.smallest_of_rows();
+    return algebra.smallest_of_rows(left_vector);
 }
 
 }  // namespace srm

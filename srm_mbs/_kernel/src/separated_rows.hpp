@@ -27,9 +27,10 @@ struct SeparatedRows {
     // The rows G (rows, n), zero at first, of `system` at q and t.
     void write(System& system, double t, const double* q, std::vector<double>& G) const;
     // The smallest singular value of the active rows of `system` at q and t, with `algebra` for
-    // these; NaN where other rows are not zero.  G as for write().
+    // these; NaN where other rows are not zero.  G as for write(), left_vector as of
+    // Algebra::weakest().
     double smallest(System& system, Algebra& algebra, double t, const double* q,
-                    std::vector<double>& G) const;
+                    std::vector<double>& G, std::vector<double>* left_vector = nullptr) const;
 };
 
 }  // namespace srm

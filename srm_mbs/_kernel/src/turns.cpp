@@ -5,6 +5,8 @@
 
 #include <Eigen/Dense>
 
+#include "critical.hpp"
+
 namespace srm {
 
 namespace {
@@ -21,17 +23,22 @@ struct Reversal {
 class TurnFinder {
 public:
     TurnFinder(const TurnSearch& search, const SeparatedRows& rows, System& all_rows,
-               const DipSearch& dips, DenseOutput& dense, System& system)
+               const DipSearch& dips, DenseOutput& dense, System& system, double tolerance,
+               const Constants& constants)
         : search_(search),
           rows_(rows),
           all_rows_(all_rows),
           dips_(dips),
           dense_(dense),
           system_(system),
+          closures_(system, search.time_unit),
+          tolerance_(tolerance),
+          constants_(constants),
           steps_(dense.steps()),
           stages_(static_cast<long>(dips.columns.size())),
           nv_(system.nv),
           nq_(system.nq),
+          columns_(static_cast<long>(rows.factors.size() / rows.supports.size())),
           state_(nq_ + nv_),
           change_(nv_),
           G_(rows.factors.size()) {}
@@ -68,24 +75,25 @@ private:
         if (!reverses(first, last, reversal) ||
             !certain(first, last, reversal, recorded.tops[from], turn))
             return false;
+        if (system_.driven() && (turn.values[0] < 0.0 || avoids(reversal.time))) return false;
         for (std::size_t i = from; i <= to; ++i) out.found[i] = 1;
         if (turn.values[0] < 0.0) out.beyond.push_back(turn);
         return true;
     }
 
-    // Whether all rates change their sign in one of the steps, once.
+    // Whether all rates that matter change their sign in one of the steps, once.
     bool reverses(long first, long last, Reversal& out) {
         long found = -1;
         for (long step = first; step <= last; ++step) {
             double along = 0.0;
-            for (int k = 0; k < nv_; ++k) along += rate(step, k) * rate(step + 1, k);
+            for (const int k : search_.columns) along += rate(step, k) * rate(step + 1, k);
             if (!(along < 0.0)) continue;
             if (found >= 0) return false;
             found = step;
         }
         if (found < 0) return false;
         double size = 0.0, before = 0.0, after = 0.0, both = 0.0;
-        for (int k = 0; k < nv_; ++k) {
+        for (const int k : search_.columns) {
             const double a = rate(found, k), b = rate(found + 1, k);
             change_[k] = b - a;
             size += change_[k] * change_[k];
@@ -100,7 +108,8 @@ private:
         for (int i = 0; i < search_.newton_steps; ++i) {
             dense_.states(system_, &t, 1, state_.data());
             double along = 0.0;
-            for (int k = 0; k < nv_; ++k) along += state_[nq_ + k] / search_.unit[k] * change_[k];
+            for (const int k : search_.columns)
+                along += state_[nq_ + k] / search_.unit[k] * change_[k];
             t = std::clamp(t - along / size * (end - start), start, end);
         }
         out = {found, t};
@@ -109,7 +118,7 @@ private:
 
     Rows rows_at(double t, const double* q) {
         rows_.write(all_rows_, t, q, G_);
-        return Rows(G_.data(), static_cast<long>(rows_.supports.size()), nv_);
+        return Rows(G_.data(), static_cast<long>(rows_.supports.size()), columns_);
     }
 
     // Whether the motion certainly did not touch the singular configuration.
@@ -129,12 +138,26 @@ private:
             turn.values[side] = svd_.matrixU().col(k).dot(G * svd_.matrixV().col(k));
         }
         if (!(turn.values[0] * turn.values[2] > 0.0)) return false;
-        // The largest value of the window follows from the recorded sigmas.
+        // The largest value of the window follows from the recorded sigmas, about.
         const long width = dense_.sigma_width(), at = std::max(top - 1, 0L);
-        const double untouched = search_.untouched *
-                                 steps_.sigmas[at / stages_ * width + dips_.columns[at % stages_]];
-        return value * steps_.sigmas[first * width] > untouched * std::abs(turn.values[0]) &&
-               value * steps_.sigmas[(last + 1) * width - 1] > untouched * std::abs(turn.values[2]);
+        const long top_step = at / stages_, stage = at % stages_;
+        const double untouched =
+            search_.untouched * steps_.sigmas[top_step * width + dips_.columns[stage]];
+        if (value * steps_.sigmas[first * width] > untouched * std::abs(turn.values[0]) &&
+            value * steps_.sigmas[(last + 1) * width - 1] > untouched * std::abs(turn.values[2]))
+            return true;
+        const double start = steps_.times[top_step], length = steps_.times[top_step + 1] - start;
+        const double t = top > 0 ? start + dips_.abscissae[stage] * length : start;
+        dense_.states(system_, &t, 1, state_.data());
+        svd_.compute(rows_at(t, state_.data()), 0);
+        return value > search_.touching * sizes[k];
+    }
+
+    // Whether the motion followed the residual of the critical configuration next to it at t (s).
+    bool avoids(double t) {
+        dense_.states(system_, &t, 1, state_.data());
+        const auto found = critical_near(closures_, t, state_, search_.reach, constants_);
+        return found && std::abs(found->residual) > tolerance_;
     }
 
     const TurnSearch& search_;
@@ -143,9 +166,13 @@ private:
     const DipSearch& dips_;
     DenseOutput& dense_;
     System& system_;
+    UnitClosures closures_;
+    const double tolerance_;
+    const Constants& constants_;
     const StepArrays& steps_;
     const long stages_;
     const int nv_, nq_;
+    const long columns_;
     std::vector<double> state_, change_, G_;
     Eigen::JacobiSVD<RowMatrix> svd_;
 };
@@ -154,8 +181,9 @@ private:
 
 Turns recorded_turns(const TurnSearch& search, const SeparatedRows& rows, System& all_rows,
                      const DipSearch& dips, const SigmaDips& recorded, DenseOutput& dense,
-                     System& system) {
-    return TurnFinder(search, rows, all_rows, dips, dense, system).among(recorded);
+                     System& system, double tolerance, const Constants& constants) {
+    return TurnFinder(search, rows, all_rows, dips, dense, system, tolerance, constants)
+        .among(recorded);
 }
 
 }  // namespace srm

@@ -5,6 +5,7 @@
 #include <array>
 #include <vector>
 
+#include "constants.hpp"
 #include "dense.hpp"
 #include "separated_rows.hpp"
 #include "sigma_dips.hpp"
@@ -12,13 +13,17 @@
 
 namespace srm {
 
-#define SRM_TURN_SEARCH(field)                                                              \
-    field(std::vector<double>, unit) /* (nv,) of the coordinates */                         \
-    field(int, rank)                 /* structural, of the rows */                          \
-    field(int, newton_steps)         /* to where the rates vanish */                        \
-    field(double, resting)           /* rate there, over its change in the step */          \
-    field(double, together)          /* the next singular value, over the smallest */       \
-    field(double, untouched)         /* the smallest, over the largest sigma of the window */
+#define SRM_TURN_SEARCH(field)                                                               \
+    field(std::vector<double>, unit) /* (nv,) of the coordinates */                          \
+    field(std::vector<int>, columns) /* of these, the ones that rows depend on */            \
+    field(int, rank)                 /* structural, of the rows */                           \
+    field(int, newton_steps)         /* to where the rates vanish */                         \
+    field(double, resting)           /* rate there, over its change in the step */           \
+    field(double, together)          /* the next singular value, over the smallest */        \
+    field(double, touching)          /* the smallest, over the largest value of the window */ \
+    field(double, untouched)         /* the same, over the largest sigma of the window */    \
+    field(double, time_unit)         /* (s), with drives */                                  \
+    field(double, reach)             /* of the search for a critical configuration */
 
 struct TurnSearch {
     SRM_FIELDS(SRM_TURN_SEARCH)
@@ -38,9 +43,10 @@ struct Turns {
 };
 
 // rows, all_rows: as of SeparatedRows::write.  dense, of steps of the tableau that `dips` is for, is
-// read with `system`.
+// read with `system`.  tolerance: residual of a critical configuration, in row units, up to which it
+// counts as singular.
 Turns recorded_turns(const TurnSearch& search, const SeparatedRows& rows, System& all_rows,
                      const DipSearch& dips, const SigmaDips& recorded, DenseOutput& dense,
-                     System& system);
+                     System& system, double tolerance, const Constants& constants);
 
 }  // namespace srm

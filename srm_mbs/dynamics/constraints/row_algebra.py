@@ -467,8 +467,8 @@ def smallest_singular_value(A: FloatArray, zero: float) -> float:
 
 
 def active_rows(A: FloatArray) -> BoolArray:
-    """Which rows of A (m, n) are not zero (m,)."""
-    active: BoolArray = np.sqrt(np.einsum("ij,ij->i", A, A)) > INERT
+    """Which rows of A (..., m, n) are not zero (..., m)."""
+    active: BoolArray = np.sqrt(np.einsum("...ij,...ij->...i", A, A)) > INERT
     return active
 
 

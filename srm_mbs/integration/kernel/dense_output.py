@@ -16,6 +16,7 @@ from srm_mbs.dynamics.constraints.structure import SMALL_REFERENCE_PIVOT, struct
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.singularities.critical import CriticalPlace
 from srm_mbs.integration import critical_passages, singular_passages
+from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
 from srm_mbs.integration.dense_output import DenseOutput, StepData
 from srm_mbs.integration.generated.code import code_of_record
 from srm_mbs.integration.kernel import marshalling
@@ -154,9 +155,11 @@ class CompiledDenseOutput(DenseOutput):
                 kernel_system.evaluations - before[0], kernel_system.factorisations - before[1]
             )
 
-    def turns(self, scheme: ButcherTableau, dips: RecordedDips) -> RecordedDips | None:
+    def turns(
+        self, scheme: ButcherTableau, dips: RecordedDips, tolerance: float
+    ) -> RecordedDips | None:
         """:func:`~srm_mbs.integration.singular_passages.recorded_turns` of a run without stiff
-        steps; None where that itself has to find them."""
+        steps; None where that itself has to find them.  ``tolerance``: as of its monitor."""
         system = self._mechanism_system
         search = None if self._by_reference else _turn_search(system.mechanism)
         if search is None:
@@ -164,7 +167,7 @@ class CompiledDenseOutput(DenseOutput):
         try:
             with self.observables.all_rows() as all_rows:
                 given = all_rows, *search, _dip_search(scheme), dips.samples, dips.tops
-                others, turns = self._read("turns", *given)
+                others, turns = self._read("turns", *given, tolerance, marshalling.CONSTANTS)
         except ArithmeticError:
             return None
         return dips.at_no_turn(others, [Turn(*turn) for turn in turns])
@@ -249,19 +252,23 @@ def recorded_dips(scheme: ButcherTableau, steps: StepData) -> RecordedDips | Non
 
 @per_start
 def _turn_search(mechanism: MechanismData) -> tuple[Any, Any] | None:
-    """``SeparatedRows`` and ``TurnSearch`` of turns.hpp; None for mechanisms with drives or with
-    many columns, of which the reference has faster algebra."""
+    """``SeparatedRows`` and ``TurnSearch`` of turns.hpp; None for mechanisms with many columns, of
+    which the reference has faster algebra."""
     geometry = geometry_of(mechanism, mechanism.q0)
-    if geometry.drives or geometry.model.nv > COMPILED_ABOVE:
+    if geometry.model.nv > COMPILED_ABOVE:
         return None
     rows = separated_rows(geometry, singular_passages.singular_values(mechanism), [])
     search = core.TurnSearch(  # type: ignore[union-attr]
         unit=geometry.coordinate_unit,
+        columns=singular_passages.turning_columns(mechanism),
         rank=structure_of(mechanism).rank,
         newton_steps=singular_passages.REVERSAL_STEPS,
         resting=singular_passages.RESTING_SPEED,
         together=singular_passages.VANISHING_TOGETHER,
+        touching=singular_passages.TOUCHING_VALUE,
         untouched=singular_passages.UNTOUCHED_VALUE,
+        time_unit=float(geometry.unit[-1]),
+        reach=singular_passages.CROSSING_SEARCH,
     )
     return rows, search
 
@@ -271,7 +278,7 @@ def recorded_turns(
 ) -> RecordedDips:
     """As :func:`srm_mbs.integration.singular_passages.recorded_turns`."""
     if isinstance(monitor.dense, CompiledDenseOutput) and not np.logical_or.reduce(steps.stiff):
-        found = monitor.dense.turns(scheme, dips)
+        found = monitor.dense.turns(scheme, dips, monitor.tolerance)
         if found is not None:
             return found
     return singular_passages.recorded_turns(monitor, scheme, steps, dips)
@@ -288,12 +295,12 @@ def critical_near(monitor: ConstraintMonitor, t: float) -> CriticalPlace | None:
 
 
 def dips_in_records(
-    system: ClosedSystem | OpenSystem, scheme: ButcherTableau, dense: DenseOutput
+    system: ClosedSystem | OpenSystem, scheme: ButcherTableau, dense: DenseOutput, tolerance: float
 ) -> RecordedDips | tuple[()] | None:
     """:func:`recorded_dips`, told from turns where the kernel can, of records of the kernel before
     they are arrays; () if they show that
     :func:`~srm_mbs.integration.singular_passages.find_crossings` finds nothing, None if they are
-    arrays, or have to be."""
+    arrays, or have to be.  ``tolerance``: as of :class:`ConstraintMonitor`."""
     if not isinstance(dense, CompiledDenseOutput) or dense.recorded is None:
         return None
     analysis = system.singularities
@@ -304,15 +311,14 @@ def dips_in_records(
         return None
     # Of driven mechanisms, layers that steps resolve are looked for as well.
     layers = analysis.driven and records.least_sigma < AVOIDED_SIGMA
-    nothing = None if layers else ()
     found = core.dips_of_records(_dip_search(scheme), records, stop)  # type: ignore[union-attr]
     if found is None:
-        return nothing
+        return None if layers else ()
     dips = RecordedDips(*found)
-    others = dense.turns(scheme, dips)
+    others = dense.turns(scheme, dips, max(tolerance, ROUNDED_RESIDUAL))
     if others is None:
         return dips
-    return others if len(others.tops) or others.turns else nothing
+    return others if others or layers else ()
 
 
 def close_to_singular(abscissae: FloatArray, sigmas: FloatArray) -> BoolArray:

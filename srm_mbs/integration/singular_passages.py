@@ -880,7 +880,7 @@ def _rank_loss_cosine(
             return None
         G = geometry.normalised(found)
     # Rows that are zero in all of them have no part.
-    active = active_rows(np.array([G, G_before, G_after])).any(axis=0)
+    active = np.logical_or.reduce(active_rows(np.array([G, G_before, G_after])))
     if not active.all():
         G, G_before, G_after = (rows[active] for rows in (G, G_before, G_after))
     left, right = monitor.near_null_spaces(G, active)
@@ -1261,7 +1261,7 @@ def _sign_changes(
         ]
     )
     G = monitor.normalised(np.concatenate([[time], times]))
-    active = active_rows(G).any(axis=0)
+    active = np.logical_or.reduce(active_rows(G))
     left, right = monitor.near_null_spaces(G[0, active], active)
     parts = (left.T @ G[1:, active] @ right).reshape(len(times), -1)
     reference = parts[times.searchsorted(t[after])]

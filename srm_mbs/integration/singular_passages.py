@@ -758,8 +758,8 @@ def recorded_turns(
     depend on, and the motion certainly did not touch the singular configuration; and those of the
     turns that lie beyond it, not before.
 
-    Of driven mechanisms the turns are left among the minima that lie beyond it, or next to a
-    critical configuration of which the motion followed the residual."""
+    Of driven mechanisms those before it are left among the minima that lie next to a critical
+    configuration of which the motion followed the residual."""
     every = np.arange(len(dips.tops))
     if np.logical_or.reduce(steps.stiff):
         return dips.at_no_turn(every, ())
@@ -811,7 +811,6 @@ def recorded_turns(
     if monitor.geometry.drives:
         short = certain & (values[0] > 0.0)
         certain[short] = [not monitor.avoids(time) for time in times[1, short].tolist()]
-        certain &= short
     taken: set[int] = set()
     turns = []
     for i in np.flatnonzero(certain).tolist():  # those of several minima first

@@ -20,7 +20,7 @@ from srm_mbs.integration import singular_passages as crossings_module
 from srm_mbs.integration.kernel import dense_output as kernel_steps
 from srm_mbs.integration.singular_passages import ConstraintMonitor
 from tests.support import reduced, turning
-from tests.support.backends import needs_kernel, on_both
+from tests.support.backends import needs_kernel, on_both, slowly_on_both
 from tests.support.bundled import load
 from tests.support.mechanisms import (
     along_x,
@@ -146,8 +146,8 @@ def beside_change_points(family: str, reach: float) -> srm.Mechanism:
     ("family", "reach"),
     [
         *(("lifted", reach) for reach in (1e-4, 1e-5, -1e-7, -1e-4, -1e-2)),
-        ("driven", -1e-5),
-        ("driven_with_pendulum", -1e-5),
+        *(("driven", reach) for reach in (1e-3, 1e-5, -1e-5)),
+        *(("driven_with_pendulum", reach) for reach in (1e-4, -1e-5)),
     ],
 )
 def test_the_kernel_tells_turns_beside_singular_configurations_as_the_reference(
@@ -175,8 +175,8 @@ def test_the_kernel_tells_turns_beside_singular_configurations_as_the_reference(
 
 
 @needs_kernel
-@pytest.mark.parametrize("reach", [-1e-3, -1e-4, 1e-3])
-def test_turns_of_a_drive_that_avoid_or_pass_a_configuration_are_searched(reach: float) -> None:
+@pytest.mark.parametrize("reach", [-1e-3, -1e-4])
+def test_turns_of_a_drive_that_avoid_a_configuration_are_searched(reach: float) -> None:
     solution = srm.simulate(beside_change_points("driven", reach), 6.0, rtol=1e-7)
     scheme, steps = solution.scheme, solution.steps
     dips = crossings_module.recorded_dips(scheme, steps)
@@ -195,6 +195,23 @@ def test_turns_of_a_drive_are_listed_where_the_run_followed_the_residual(
     mechanism = beside_change_points(family, -1e-5)
     solution = srm.simulate(mechanism, 12.0, rtol=1e-7, singular_tolerance=tolerance)
     assert [crossing.kind for crossing in solution.crossings] == ["avoided"] * listed
+
+
+@slowly_on_both
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6])
+@pytest.mark.parametrize("family", ["driven", "driven_with_pendulum"])
+@pytest.mark.parametrize("reach", [4e-7, 1e-5, 1e-4, 1e-2])
+def test_a_drive_that_turns_beyond_a_change_point_passes_it_twice(
+    family: str, reach: float, rtol: float, backend: str
+) -> None:
+    mechanism = beside_change_points(family, reach)
+    crossings = srm.simulate(mechanism, 30.0, rtol=rtol, backend=backend).crossings
+    # The crank is at -SWING + reach - SWING cos(t).
+    away = np.arccos((reach - turning.SWING) / turning.SWING)
+    turns = np.pi * np.array([1.0, 3.0, 5.0, 7.0, 9.0])
+    expected = np.sort(np.concatenate([turns - (np.pi - away), turns + (np.pi - away)]))
+    assert [crossing.kind for crossing in crossings] == ["passed"] * 10
+    np.testing.assert_allclose([crossing.time for crossing in crossings], expected, atol=1e-4)
 
 
 def test_a_start_on_a_singular_configuration_is_no_passage() -> None:

@@ -75,7 +75,7 @@ private:
         if (!reverses(first, last, reversal) ||
             !certain(first, last, reversal, recorded.tops[from], turn))
             return false;
-        if (system_.driven() && (turn.values[0] < 0.0 || avoids(reversal.time))) return false;
+        if (system_.driven() && turn.values[0] > 0.0 && avoids(reversal.time)) return false;
         for (std::size_t i = from; i <= to; ++i) out.found[i] = 1;
         if (turn.values[0] < 0.0) out.beyond.push_back(turn);
         return true;

@@ -156,11 +156,12 @@ def test_a_run_whose_steps_would_fill_the_memory_ends_and_says_to_give_output_ti
 ) -> None:
     mechanism = load("squeezing_mechanism")  # whose motor has no limit: ever more steps a second
     whole = srm.simulate(mechanism, 1.0, backend="kernel")
-    monkeypatch.setattr(driver, "MOST_STEP_BYTES", 5e6)
+    monkeypatch.setattr(driver, "NOTICEABLE_BYTES", 1e6)
+    monkeypatch.setattr(driver, "free_memory", lambda: 5e6)
     with pytest.warns(srm.FailedRunWarning):
         ended = srm.simulate(mechanism, 1.0, backend="kernel")
     assert not ended.success
-    assert "of the memory of this machine. Everything up to there is kept. Give t_eval" in (
+    assert "half of the memory that was left. Everything up to there is kept. Give t_eval" in (
         ended.message
     )
     count = len(ended.t)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -22,6 +21,7 @@ from srm_mbs.integration.events import EventWatch
 from srm_mbs.integration.kernel.events import CompiledEventWatch
 from srm_mbs.integration.kernel.marshalling import DECISIONS, steps_from
 from srm_mbs.integration.kernel.run import CompiledRun, CompiledStepDense, ReturnReason
+from srm_mbs.integration.memory import free_memory
 from srm_mbs.integration.messages import RunFailure, StopReason
 from srm_mbs.integration.methods.butcher import ButcherTableau
 
@@ -164,7 +164,7 @@ def integrate(
     started = time.perf_counter()
     one_by_one = tick is not None or events is not None
     core = run.core
-    size = step_bytes(run.method.scheme, system.tangent_size)
+    size, unnoticed = step_bytes(run.method.scheme, system.tangent_size), NOTICEABLE_BYTES
     try:
         if events is not None:
             events.begin(run.t0, start)
@@ -189,10 +189,13 @@ def integrate(
                 failure = why_stopped(reason, system, run)
                 record.mark_failed(failure, core.t, core.h, core.memory().sigma, run.adaptive)
                 break
-            if core.count * size > MOST_STEP_BYTES and reason is ReturnReason.CHUNK_FULL:
-                failure = _out_of_memory(core.count, size)
-                record.mark_failed(failure, core.t, core.h, core.memory().sigma, run.adaptive)
-                break
+            if core.count * size > unnoticed and reason is ReturnReason.CHUNK_FULL:
+                left = free_memory()
+                if core.count * size > left:  # before the system ends the program
+                    failure = _out_of_memory(core.count, size)
+                    record.mark_failed(failure, core.t, core.h, core.memory().sigma, run.adaptive)
+                    break
+                unnoticed = core.count * size + BETWEEN_LOOKS * left
             if not one_by_one or core.count == made:
                 continue
             t, state = core.t, core.state
@@ -225,23 +228,17 @@ def integrate(
     return record
 
 
-def _physical_memory() -> float:
-    """Memory of this machine (bytes); infinite where the system does not say."""
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):  # Windows has no sysconf
-        return np.inf
-
-
-MOST_STEP_BYTES = 0.5 * _physical_memory()
-"""Size of the steps at which a run ends, before the system ends the program."""
+NOTICEABLE_BYTES = 1e8
+"""Size of the steps from which on it is compared with the memory that is left."""
+BETWEEN_LOOKS = 0.1
+"""Its growth from one comparison to the next, over the memory that is left."""
 
 
 def _out_of_memory(count: int, size: int) -> RunFailure:
     """The failure of a run with ``count`` steps of ``size`` bytes."""
     return RunFailure(
         StopReason.MEMORY,
-        f"its {count} steps take {count * size / 1e9:.2g} GB, half of the memory of this machine",
+        f"its {count} steps take {count * size / 1e9:.2g} GB, half of the memory that was left",
         "Give t_eval, the output times: the run then keeps no other state",
     )
 

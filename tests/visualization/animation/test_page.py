@@ -220,10 +220,10 @@ def test_the_controls_are_reached_by_tab_and_have_names_to_be_read_aloud(page: A
     for found, selector in named.items():
         assert found.count() == 1, selector
         assert found.evaluate("(node, s) => node.matches(s)", selector)
-    page.evaluate("seek(2)")
+    page.evaluate(READ, 2.0)
+    assert page.get_by_role("slider").get_attribute("aria-valuetext") == "2.00 / 8.00 s"
     assert page.get_by_role("button", name="Play", exact=True).count() == 1
     assert page.get_by_role("button", name="singular configuration passed").count() == 4
-    page.wait_for_function("slider.getAttribute('aria-valuetext') === '2.00 / 8.00 s'")
     page.locator("#toggle").focus()
     reached = []
     for _ in range(4):
@@ -529,13 +529,10 @@ def test_panel_and_slider_tell_the_time_of_the_run_with_the_digits_that_it_needs
 ) -> None:
     solution = srm.simulate(load("slider_crank"), span[1], t0=span[0])
     with exported(browser, tmp_path, solution) as page:
-        page.evaluate("seek(0.25 * viewer.animator.duration)")
-        page.wait_for_function(
-            "words => document.querySelector('output').value === words", arg=clock
-        )
-        assert (
-            page.evaluate("document.querySelector('#panel td:nth-child(2)').textContent") == panel
-        )
+        # Where the page stopped playing, the clock may have the same digits already.
+        [_, shown, _], *_ = page.evaluate(READ, 0.25 * (span[1] - span[0]))
+        assert shown == panel
+        assert page.evaluate("clock.value") == clock
         assert page.locator("#time").get_attribute("aria-valuetext") == clock
 
 

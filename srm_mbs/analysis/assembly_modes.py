@@ -17,7 +17,12 @@ import pinocchio as pin
 
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.assembly.assemble import Assembly, assemble
-from srm_mbs.assembly.position import ClosureProblem, close_positions, onto_singular_point
+from srm_mbs.assembly.position import (
+    ClosureProblem,
+    close_positions,
+    onto_singular_point,
+    turned_within_limits,
+)
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.errors import InputError, counted, get_logger, naming, safe_repr
@@ -122,8 +127,9 @@ def assembly_modes(
     -------
     list of AssemblyMode
         At rest, the one closest to the initial configuration first; hinge angles within half a turn
-        of it.  If one was ``found`` from few starts only, others may be missing; more ``starts``
-        find them.  Empty if no configuration closes.
+        of it, or a whole number of turns away, within the limits of their joint.  Modes that lie
+        beyond limits are listed as well.  If one was ``found`` from few starts only, others may be
+        missing; more ``starts`` find them.  Empty if no configuration closes.
 
     Raises
     ------
@@ -179,7 +185,7 @@ def assembly_modes(
     order = sorted(range(len(modes)), key=lambda k: problem.distance(modes[k]))
     return [
         AssemblyMode(
-            **vars(assemble(mechanism, modes[k], hold=held)),
+            **vars(assemble(mechanism, turned_within_limits(problem, modes[k], free), hold=held)),
             found=counts[k],
             starts=int(starts),
             held=held,

@@ -536,6 +536,19 @@ def beyond_limits(mechanism: MechanismData, q: FloatArray) -> dict[str, tuple[fl
     return out
 
 
+def turned_within_limits(problem: ClosureProblem, q: FloatArray, free: IndexArray) -> FloatArray:
+    """q (nq,), its periodic angles among ``free`` that are beyond their limits turned by whole
+    turns to within them, where that is possible."""
+    out, periodic = q.copy(), problem.periodic
+    for _, i, j, low, high in _limited(problem.mechanism):
+        if j in periodic and j in free:
+            least = np.ceil((low - LIMIT_TOLERANCE - q[i]) / (2.0 * np.pi))
+            most = np.floor((high + LIMIT_TOLERANCE - q[i]) / (2.0 * np.pi))
+            if least <= most:
+                out[i] += 2.0 * np.pi * np.clip(0.0, least, most)
+    return out
+
+
 def assemble_within_limits(
     problem: ClosureProblem, start: FloatArray, free: IndexArray
 ) -> FloatArray | None:

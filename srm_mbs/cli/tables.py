@@ -13,6 +13,7 @@ from srm_mbs.analysis.equilibrium import NEUTRAL_STIFFNESS, Equilibrium
 from srm_mbs.analysis.linearisation import Linearisation
 from srm_mbs.analysis.path_following import FollowedPath
 from srm_mbs.analysis.summary import force_text, position_text, vector_text
+from srm_mbs.assembly.position import beyond_limits
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import angle_coordinates, coordinate_units
 from srm_mbs.simulation.energy_balance import EnergyBalance
@@ -39,11 +40,14 @@ def position_rows(mechanism: Mechanism, q: FloatArray) -> list[tuple[str, str]]:
 
 
 def mode_rows(mechanism: Mechanism, modes: Sequence[AssemblyMode]) -> Iterator[tuple[str, ...]]:
-    """(number, starts that led to it, singular, position of each joint) of each assembly mode."""
+    """(number, starts that led to it, whether it is singular or beyond joint limits, position of
+    each joint) of each assembly mode."""
     for number, mode in enumerate(modes, 1):
         positions = (text for _, text in position_rows(mechanism, mode.q))
-        singular = "singular" if mode.singular else ""
-        yield str(number), f"{mode.found} of {mode.starts}", singular, *positions
+        remarks = ["singular"] * mode.singular
+        if beyond := beyond_limits(mechanism, mode.q):
+            remarks.append(f"beyond the limits of {', '.join(beyond)}")
+        yield str(number), f"{mode.found} of {mode.starts}", "; ".join(remarks), *positions
 
 
 def _own(mechanism: Mechanism, name: str, values: FloatArray) -> FloatArray:

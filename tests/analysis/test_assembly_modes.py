@@ -9,6 +9,8 @@ import pinocchio as pin
 from scipy.optimize import brentq
 
 import srm_mbs as srm
+from srm_mbs.assembly.position import beyond_limits
+from srm_mbs.cli.tables import mode_rows
 from srm_mbs.dynamics.scaling import periodic_coordinates
 from tests.support.mechanisms import along_x, rod
 
@@ -64,6 +66,29 @@ def test_a_four_bar_has_the_two_modes_of_its_circles() -> None:
     assert sum(mode.found for mode in modes) <= modes[0].starts == 40
     assert min(mode.found for mode in modes) >= 10
     np.testing.assert_allclose(modes[0].q, mechanism.q0, atol=1e-12)  # the nearest one first
+
+
+def test_angles_lie_within_the_limits_of_their_joints_where_turns_allow_it() -> None:
+    mechanism = srm.load("four_bar")
+    limited = {"coupler": (-1.0, 1.0), "rocker": (-np.pi, np.pi)}
+    model = mechanism.model
+    low, high = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
+    for name, limits in limited.items():
+        low[mechanism.joint(name).idx_q], high[mechanism.joint(name).idx_q] = limits
+    model.lowerPositionLimit, model.upperPositionLimit = low, high
+    modes = srm.assembly_modes(mechanism, {"crank": 1.0}, starts=40)
+    end, pivot = np.array([np.cos(1.0), np.sin(1.0)]), np.array([2.2, 0.0])
+    exact = []
+    for meet in circles(end, 2.0, pivot, 1.5):
+        coupler, rocker = (np.arctan2(*(meet - place)[::-1]) for place in (end, pivot))
+        exact.append((1.0, coupler - 1.0, rocker))
+    # The second one's coupler is beyond its limits at every turn, and stays nearest to the start.
+    np.testing.assert_allclose([mode.q for mode in modes], exact, atol=1e-12)
+    assert beyond_limits(mechanism, modes[0].q) == {}
+    assert list(beyond_limits(mechanism, modes[1].q)) == ["coupler"]
+    [first, second] = mode_rows(mechanism, modes)
+    assert first[2] == ""
+    assert second[2] == "beyond the limits of coupler"
 
 
 def test_two_arms_that_reach_one_point_have_four_modes() -> None:

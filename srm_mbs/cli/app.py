@@ -25,7 +25,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import typer
 
 import srm_mbs
-from srm_mbs.cli import analysis, playback, plot_report
+from srm_mbs.cli import analysis, motion_table, playback, plot_report
 from srm_mbs.cli.model_file import ModelFile, named_numbers, reads_model
 from srm_mbs.cli.output import (
     BAD_INPUT,
@@ -33,7 +33,6 @@ from srm_mbs.cli.output import (
     RUN_FAILED,
     Html,
     Lines,
-    PrintedLines,
     check_output,
     echo,
     flush_output,
@@ -48,14 +47,10 @@ from srm_mbs.cli.output import (
 from srm_mbs.errors import InputError
 
 if TYPE_CHECKING:
-    from srm_mbs._typing import FloatArray
     from srm_mbs.dynamics.mechanism import Mechanism
 
 T_END, RTOL = 10.0, 1e-6
 """End time (s) and tolerance where neither the command nor the description gives one."""
-STANDARD_OUTPUT = Path("-")
-MOST_ROWS = 10_000_000
-"""Of a table at equal times."""
 HARNESS = Path("benchmarks", "work_precision", "__main__.py")
 """The benchmark in a checkout of the source."""
 
@@ -152,7 +147,7 @@ def simulate(
             show_default="1e-9",
         ),
     ] = None,
-    out: Annotated[Path | None, option("RUN.npz", "Save the run, for plot and play.")] = None,
+    out: Annotated[Path | None, option("RUN.npz", "Save the run, for plot, play and csv.")] = None,
     plot: Annotated[Path | None, option("FILE", "Plot the run as .png, .pdf or .svg.")] = None,
     csv: Annotated[
         Path | None,
@@ -162,19 +157,8 @@ def simulate(
             "error.",
         ),
     ] = None,
-    every: Annotated[
-        float | None,
-        option("S", "Write a row of the table every S seconds instead.", show_default="the steps"),
-    ] = None,
-    points: Annotated[
-        list[str] | None,
-        several(
-            "--point",
-            playback.NAMED_POINT,
-            "Add the motion of this point, by its name or of a link (m, in the link's frame), to "
-            "the table.",
-        ),
-    ] = None,
+    every: motion_table.Every = None,
+    points: motion_table.Points = None,
     html: Html = None,
     image: playback.Image = None,
     at: playback.At = None,
@@ -236,7 +220,6 @@ def simulate(
     are written and the exit status is 1. Of an interrupted run singular passages are not counted.
     """
     from srm_mbs.analysis.summary import run_rows
-    from srm_mbs.dynamics.point_motion import place_of
     from srm_mbs.simulation.options import SINGULAR_TOLERANCE
 
     check_output(out, "--out", (".npz",))
@@ -244,8 +227,8 @@ def simulate(
         from srm_mbs.visualization.plotting.figure import FORMATS
 
         check_output(plot, "--plot", FORMATS)
-    printed = csv == STANDARD_OUTPUT
-    check_output(None if printed else csv, "--csv", (".csv",))
+    motion_table.check_table(csv, "--csv")
+    printed = csv == motion_table.STANDARD_OUTPUT
     check_output(html, "--html", HTML_SUFFIXES)
     picture = playback.image_options(image, at, size, dpi)
     playback.check_video(video)
@@ -253,32 +236,23 @@ def simulate(
     mechanism = _started(file.load(base=base, gravity=_vector(gravity, "--gravity")), q, v)
     overlays = playback.overlay_options(mechanism, trace, gaps, reactions, arrows)
     playback.check_overlays(trace, gaps, reactions, arrows, (html, image, video, play, live))
-    added = playback.points_or_names(points)
-    if added and csv is None:
-        raise InputError(
-            "it is added to the table of the motion, and none is asked for",
-            element="--point",
-            remedy="Give --csv too",
-        )
-    for point in added:
-        place_of(mechanism, point, "--point")
-    if every is not None and csv is None:
-        raise InputError(
-            "it is about the table of the motion, and none is asked for",
-            element="--every",
-            remedy="Give --csv too",
-        )
-    if full_paths and out is None:
-        raise InputError(
-            "it is about the saved run, and none is asked for",
-            element="--full-paths",
-            remedy="Give --out too",
-        )
+    for element, given, about, path, needed in (
+        ("--point", points, "table of the motion", csv, "--csv"),
+        ("--every", every is not None, "table of the motion", csv, "--csv"),
+        ("--full-paths", full_paths, "saved run", out, "--out"),
+    ):
+        if given and path is None:
+            raise InputError(
+                f"it is about the {about}, and none is asked for",
+                element=element,
+                remedy=f"Give {needed} too",
+            )
+    added = motion_table.table_points(mechanism, points)
     defaults = mechanism.defaults
     t_end = _first(t_end, defaults.t_end, T_END)
     playback.check_time(at, t_end)
     if every is not None:
-        _equal_times(every, t_end)
+        motion_table.equal_times(every, 0.0, t_end)
     controller = None
     if control:
         controls = named_numbers(control, "--control", "actuator", "hip")
@@ -297,7 +271,7 @@ def simulate(
         backend=backend,
         singular_tolerance=_first(singular_tolerance, None, SINGULAR_TOLERANCE),
     )
-    times = None if every is None else _equal_times(every, float(solution.t[-1]))
+    times = None if every is None else motion_table.equal_times(every, *solution.span)
     written, failed = write_files(
         [
             (out, partial(solution.save, full_paths=full_paths)),
@@ -310,10 +284,7 @@ def simulate(
     )
     rows = run_rows(solution, passages=solution.status != "interrupted")
     if printed:
-        from srm_mbs.simulation.csv_export import write_csv
-
-        shown = solution if times is None else solution.at(times)
-        write_csv(shown, PrintedLines(), added, reactions=False)
+        motion_table.print_table(solution, times, added)
     table([*rows, *(("written", str(path)) for path in written)], err=printed)
     if balance:
         from srm_mbs.cli.tables import balance_rows
@@ -326,27 +297,6 @@ def simulate(
         raise typer.Exit(BAD_INPUT)
     if not solution.success:
         raise typer.Exit(RUN_FAILED)
-
-
-def _equal_times(every: float, end: float) -> FloatArray:
-    """Times (k,) s from 0 to ``end`` (s), ``every`` seconds apart.
-
-    Raises
-    ------
-    InputError
-        For an interval that is not positive, or more than :data:`MOST_ROWS` of them.
-    """
-    if not every > 0.0 or end / every > MOST_ROWS:
-        raise InputError(
-            f"an interval of {every:g} s gives no table of {end:g} s",
-            element="--every",
-            remedy=f"Give at least {max(end, 1e-300) / MOST_ROWS:.1g} s",
-        )
-    import numpy as np
-
-    # A last time that rounding moves beyond the end is the end.
-    times: FloatArray = np.minimum(every * np.arange(int(end / every * (1.0 + 1e-12)) + 1), end)
-    return times
 
 
 def _vector(text: str | None, element: str) -> list[float] | None:
@@ -518,7 +468,7 @@ def _first_sentence(path: Path) -> str:
 
 
 for command in (
-    *(playback.play, plot_report.plot, plot_report.report),
+    *(playback.play, plot_report.plot, motion_table.csv, plot_report.report),
     *(analysis.modes, analysis.equilibrium, analysis.linearise, analysis.linkage, analysis.drag),
 ):
     app.command()(command)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import re
 import shlex
@@ -21,7 +22,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.analysis.summary import joint_rows
 from tests.cli.conftest import Describe
-from tests.support.commands import ROOT, command, row, run, run_apart
+from tests.support.commands import ROOT, command, error_line, row, run, run_apart
 from tests.support.urdf_files import tree
 from tools.pages import DOCS, blocks
 
@@ -88,6 +89,7 @@ def test_info_of_a_saved_run_shows_the_residuals_of_the_singular_configurations_
         ("models", "package"),
         ("play", "RUN browser"),
         ("plot", "RUN --out .png .pdf .svg"),
+        ("csv", "RUN --out --every --point --reactions RUN.csv"),
     ],
 )
 def test_every_command_has_help_on_its_arguments_and_options(name: str, words: str) -> None:
@@ -578,6 +580,52 @@ def test_a_printed_table_is_all_of_standard_output(tmp_path: Path) -> None:
 def test_an_interval_that_gives_no_table_is_refused_before_the_run(every: object) -> None:
     options = ("--t-end", 1, "--csv", "-", "--every", every)
     assert "--every: an interval of" in run("simulate", "four_bar", *options, status=2)
+
+
+def test_csv_writes_the_table_of_a_saved_run(saved_run: Path, tmp_path: Path) -> None:
+    path, point = tmp_path / "table.csv", ("--point", "rod:2,0,0")
+    simulate = ("simulate", "slider_crank", "--t-end", 2, "--csv", path, *point)
+    for every in ((), ("--every", 0.3)):
+        run(*simulate, *every)
+        table = path.read_text(encoding="utf-8")
+        assert run("csv", saved_run, "--out", "-", *point, *every) == table
+    shutil.copy(saved_run, tmp_path / "own.npz")
+    assert run("csv", tmp_path / "own.npz") == f"written: {tmp_path / 'own.csv'}\n"
+    head = (tmp_path / "own.csv").read_text(encoding="utf-8").splitlines()[0]
+    assert head.startswith("t (s),crank (rad),")
+
+
+def test_csv_begins_where_the_run_begins_and_has_reactions_on_request(tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    solution = srm.simulate(srm.load("four_bar"), -1.0, t0=-1.5)
+    solution.save(path)
+    lines = run("csv", path, "--out", "-", "--every", 0.2, "--reactions").splitlines()
+    head, *rows = csv.reader(lines)
+    times = [-1.5, -1.3, -1.1]
+    np.testing.assert_allclose([float(row[0]) for row in rows], times, rtol=1e-15)
+    found = [float(row[head.index("closure pin fx (N)")]) for row in rows]
+    np.testing.assert_allclose(found, solution.at(times).reactions["pin"][:, 0], rtol=1e-9)
+
+
+def test_csv_names_file_element_and_remedy_of_what_it_refuses(
+    saved_run: Path, tmp_path: Path
+) -> None:
+    for words, *parts in (
+        (("--every", 0), "--every", "an interval of 0 s", "Give at least 2e-07 s"),
+        (("--point", "wheel:0,0,0"), "--point", "wheel", "Known: "),
+        (("--out", tmp_path / "run.xls"), "run.xls: --out: the suffix '.xls'", "Use .csv"),
+        (("--out", tmp_path / "none" / "run.csv"), "there is no folder", "Make it first"),
+    ):
+        line = error_line(run("csv", saved_run, *words, status=2))
+        assert all(part in line for part in parts), line
+    controlled, empty = tmp_path / "controlled.npz", tmp_path / "empty.npz"
+    srm.simulate(srm.load("four_bar"), 0.1, controller=lambda t, q, v: np.zeros(3)).save(controlled)
+    for words in (("--reactions",), ("--point", "rocker:1,0,0")):
+        line = error_line(run("csv", controlled, *words, status=2))
+        assert line.startswith(f"error: {controlled}: {words[0]}: the "), line
+        assert line.endswith("simulate again"), line
+    empty.touch()
+    assert f"error: {empty}: " in run("csv", empty, status=2)
 
 
 def test_play_writes_the_page_of_a_saved_run(saved_run: Path, tmp_path: Path) -> None:

@@ -212,7 +212,11 @@ def loop_rows(mechanism: Mechanism) -> Iterator[tuple[str, str, str, str, str]]:
         own, turned = g[at : at + loop.rows.count], angles[at : at + loop.rows.count]
         at += loop.rows.count
         gaps = [(own[~turned], "m"), (own[turned], "rad")]
-        gap = ", ".join(f"{np.linalg.norm(part):.1e} {unit}" for part, unit in gaps if len(part))
+        gap = ", ".join(
+            f"{np.linalg.norm(part):.1e} {unit}" if part.any() else f"0 {unit}"
+            for part, unit in gaps
+            if len(part)
+        )
         if loop.joints is not None:
             yield loop.name, loop.type_name, ", ".join(loop.joints), _relation(loop), gap
             continue

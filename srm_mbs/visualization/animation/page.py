@@ -248,7 +248,7 @@ def values_over_crank(motion: CrankPositions) -> dict[str, Any]:
         )
         if name != motion.crank:
             samples = _rounded(rate[kept] * scale / factor)
-            per = f"{own}/{unit}"
+            per = "" if own == unit else f"{own}/{unit}"
             label = f"{name} per {motion.crank}"
             values.append({"label": label, "unit": per, "samples": samples, "body": node})
     # A crank that turns begins at a whole turn, which is written as 0.

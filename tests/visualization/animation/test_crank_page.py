@@ -170,7 +170,7 @@ def test_a_click_shows_positions_in_degrees_and_the_ratio_of_the_rates(
     assert float(cells["rocker"][0]) == pytest.approx(psi[100], rel=6e-3)
     slope = 0.5 * (psi[101] - psi[99])
     assert float(cells["rocker per crank"][0]) == pytest.approx(slope, rel=6e-3, abs=1e-3)
-    assert cells["rocker per crank"][1] == "°/°"
+    assert cells["rocker per crank"][1] == ""
     assert float(cells["transmission angle"][0]) == pytest.approx(
         np.degrees(motion.transmission_angle[100]), rel=6e-3
     )

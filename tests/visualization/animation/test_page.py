@@ -515,6 +515,42 @@ def test_nothing_covers_the_picture_or_leaves_the_window(page: Any, size: tuple[
     page.set_viewport_size(before)
 
 
+MANY = """() => {
+  for (let i = 0; i < 40; i++) {
+    about.values.push({ label: `value ${i}`, unit: "N", body: "crank",
+      samples: about.joint_times.map(t => 1500 + Math.cos(t)) });
+  }
+  add_curve(about.values.at(-1));
+}"""
+
+
+@pytest.mark.browser
+def test_a_long_panel_is_scrolled_and_a_curve_has_the_digits_of_its_range(page: Any) -> None:
+    before = page.viewport_size
+    page.evaluate("choose(''); toggle_curves()")
+    page.evaluate(MANY)
+    ends = page.locator(".curve").last.locator(".ends span").all_inner_texts()
+    assert ends == ["1501.0", "1499.0"]
+    page.evaluate("toggle_curves()")
+    for size in (before, {"width": 390, "height": 600}):
+        page.set_viewport_size(size)
+        page.wait_for_function("!element('panel').classList.contains('long')")
+        assert page.evaluate("getComputedStyle(element('panel')).pointerEvents") == "none"
+        page.evaluate("choose('crank')")
+        page.wait_for_function("element('panel').classList.contains('long')")
+        panel, scale = (page.locator(name).bounding_box() for name in ("#panel", "#scale"))
+        assert panel["y"] + panel["height"] < scale["y"]
+        page.mouse.move(panel["x"] + 30.0, panel["y"] + 30.0)
+        page.mouse.wheel(0.0, 2000.0)
+        page.wait_for_function(
+            "document.querySelector('#panel tr:last-child').getBoundingClientRect().bottom"
+            " <= element('panel').getBoundingClientRect().bottom"
+        )
+        page.evaluate("choose('')")
+    page.evaluate("about.values.splice(-40); lay_out()")
+    page.set_viewport_size(before)
+
+
 @pytest.mark.browser
 @pytest.mark.parametrize(
     ("span", "panel", "clock"),

@@ -1,11 +1,12 @@
 // Curves of chosen values below the picture, in step with it.
 const CURVE_HEIGHT = 84, GAP = 4;  // pixels
+const MOST_DIGITS = 7;  // for which there is room beside a curve
 const svg = (parent, tag, attributes) => {
   const made = parent.appendChild(document.createElementNS("http://www.w3.org/2000/svg", tag));
   for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
   return made;
 };
-let curves = [];  // of { value, cursor }
+let curves = [];  // of { value, digits, cursor, here }
 
 // A line through the finite samples, with gaps at the others; x from 0 to 1000.
 function path_of(value, low, high) {
@@ -29,8 +30,13 @@ function add_curve(value) {
   if (!samples.length) [low, high] = [0, 1];
   // What is zero but for rounding is written as zero.
   const ends = [high, low].map((end) => Math.abs(end) < 1e-9 * (high - low) ? 0 : end);
-  // Of what is constant but for rounding, the middle.
-  if (high - low <= 1e-9 * Math.max(Math.abs(low), Math.abs(high))) {
+  // Enough digits to see it vary; of what is constant but for rounding, the middle.
+  const size = Math.max(Math.abs(low), Math.abs(high));
+  let digits = 3;
+  if (high - low > 1e-9 * size) {
+    const needed = 2 + Math.ceil(Math.log10(size / (high - low)));
+    digits = Math.min(Math.max(needed, digits), MOST_DIGITS);
+  } else {
     const room = Math.abs(low) || 1;
     [low, high] = [low - room, high + room];
   }
@@ -42,10 +48,11 @@ function add_curve(value) {
   remove.setAttribute("aria-label", `remove the curve of ${value.label}`);
   const box = add(row, "div", { className: "plot" });
   const scale = add(box, "div", { className: "ends" });
-  for (const end of ends) add(scale, "span", { textContent: shown(end) });
+  for (const end of ends) add(scale, "span", { textContent: shown(end, digits) });
   const plot = svg(box, "svg", {
     viewBox: `0 0 1000 ${CURVE_HEIGHT}`, preserveAspectRatio: "none", role: "img",
-    "aria-label": `${value.label} over ${about.crank?.label ?? "time"}, from ${shown(ends[1])} to ${shown(ends[0])} ${value.unit}`,
+    "aria-label": `${value.label} over ${about.crank?.label ?? "time"}, from `
+      + `${shown(ends[1], digits)} to ${shown(ends[0], digits)} ${value.unit}`,
   });
   for (const { time } of about.passages) {
     const x = 1000 * (time - about.start) / animator.duration;
@@ -61,7 +68,7 @@ function add_curve(value) {
   };
   plot.onpointerdown = (event) => { plot.setPointerCapture(event.pointerId); move(event); };
   plot.onpointermove = move;
-  const curve = { value, cursor, here };
+  const curve = { value, digits, cursor, here };
   curves.push(curve);
   remove.onclick = () => {
     curves = curves.filter((other) => other !== curve);
@@ -104,9 +111,9 @@ at_layout.push(() => {
 at_frame.push((time) => {
   if (element("curves").hidden) return;
   const x = 1000 * (time - about.start) / animator.duration;
-  for (const { value, cursor, here } of curves) {
+  for (const { value, digits, cursor, here } of curves) {
     cursor.setAttribute("x1", x);
     cursor.setAttribute("x2", x);
-    here.textContent = `${shown(value_at(value, time))} ${value.unit}`;
+    here.textContent = `${shown(value_at(value, time), digits)} ${value.unit}`;
   }
 });

@@ -109,6 +109,15 @@ function fill_panel() {
   make_room();
 }
 
+// A long panel takes the pointer, to be scrolled; through others the picture is turned.
+const lengths = new ResizeObserver(() => {
+  const panel = element("panel");
+  panel.classList.toggle("long", panel.scrollHeight > panel.clientHeight);
+});
+for (const part of [pane, document.querySelector("#panel table"), element("notes")]) {
+  lengths.observe(part);
+}
+
 // In a small window the notes would lie on the motion: there a button unfolds them.
 const SMALL = [640, 420], MOST_COVERED = 0.25;  // pixels; part of the height of the picture
 let unfolded = false;
@@ -143,11 +152,11 @@ function value_at(value, time) {
   return before + (after - before) * (time - times[low]) / (times[high] - times[low]);
 }
 
-function shown(value) {
+function shown(value, digits = 3) {
   if (value === null) return "–";
   const size = Math.abs(value);
   if (size === 0) return "0";
-  return (size >= 1e-3 && size < 1e4 ? value.toPrecision(3) : value.toExponential(2))
+  return (size >= 1e-3 && size < 1e4 ? value.toPrecision(digits) : value.toExponential(digits - 1))
     .replace("-", "\u2212").replace("e-", "e\u2212").replace("e+", "e");
 }
 

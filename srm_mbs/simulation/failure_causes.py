@@ -40,6 +40,8 @@ SLOPE_STEP = 1e-4
 """Step of the difference for the second derivative of a coordinate along the motion."""
 FLAT = 1e-9
 """Slope of a coordinate along the motion that is zero."""
+IDLE = 1e-5
+"""Second derivative of a coordinate, over the largest, along freedoms that do not move it."""
 COARSE = 1e-10
 """Rounding of a position, over its unit, from which it may be what a run fails by: a hundred times
 the largest closure error of a start."""
@@ -152,9 +154,10 @@ def dead_point(mechanism: Mechanism, t: float, q: FloatArray) -> FailureCause | 
     extreme position of the motion that the closures and the other drives leave; None if there is
     none.  Drives that do so together are all at theirs: it is that of the fastest.
 
-    For mechanisms that are left with one degree of freedom without this drive.  On the curve of
-    their configurations, with the coordinate z, Newton's method finds dq_drive/dz = 0.  Rates are
-    those of the laws: that of a joint next to its dead point may have lost its sign.
+    Without this drive the mechanism has the coordinates z.  Newton's method finds dq_drive/dz = 0,
+    where the second derivatives show whether that is an extreme; they are zero for idle freedoms,
+    such as the spin of a rod between balls.  Rates are those of the laws: that of a joint next to
+    its dead point may have lost its sign.
     """
     drives = [drive for drive in mechanism.drives if drive.joint is not None]
     if len(drives) < len(mechanism.drives):
@@ -185,25 +188,34 @@ def _dead_point_of(
     name = str(drive.joint)
     own = _coordinate_of(mechanism, drive)
     basis, _ = tangent_basis(geometry, q, free)
-    if basis.shape[1] != 1 or abs(basis[own, 0]) > NEAR_DEAD_POINT:
+    size = basis.shape[1]
+    if not size or np.linalg.norm(basis[own]) > NEAR_DEAD_POINT:
         return None
     chart = TangentChart(geometry, q, basis, free)
 
-    def at(z: float) -> tuple[ChartPoint | None, float]:
-        point = chart.point(np.array([z]))
-        return point, np.inf if point is None else float(point.velocities[own, 0])
+    def at(z: FloatArray) -> tuple[ChartPoint | None, FloatArray]:
+        """The configuration, and the slopes (k,) of the driven coordinate there."""
+        point = chart.point(z)
+        return point, np.full(size, np.inf) if point is None else point.slopes[own]
 
-    z = 0.0
+    z = np.zeros(size)
     point, slope = at(z)
     for _ in range(NEWTON_STEPS):
-        bend = (at(z + SLOPE_STEP)[1] - at(z - SLOPE_STEP)[1]) / (2.0 * SLOPE_STEP)
-        if not np.isfinite(bend) or bend == 0.0 or abs(slope) <= FLAT:
+        with np.errstate(invalid="ignore"):
+            columns = [at(z + step)[1] - at(z - step)[1] for step in SLOPE_STEP * np.eye(size)]
+        hessian = np.column_stack(columns) / (2.0 * SLOPE_STEP)
+        if not np.isfinite(hessian).all() or np.linalg.norm(slope) <= FLAT:
             break
-        z -= slope / bend
+        z = z - np.linalg.lstsq(hessian, slope, rcond=IDLE)[0]
         point, slope = at(z)
-    if point is None or not (abs(slope) <= FLAT and np.isfinite(bend) and bend != 0.0):
+    if point is None or not (np.linalg.norm(slope) <= FLAT and np.isfinite(hessian).all()):
         return None
-    if abs(point.u[own]) > NEAR_DEAD_POINT or rate * bend >= 0.0:
+    bends = np.linalg.eigvalsh(0.5 * (hessian + hessian.T))
+    bend = bends[np.argmax(np.abs(bends))]
+    # Neither a saddle, from where the joint goes on, nor beyond the dead point.
+    if bend == 0.0 or (bends / bend < -IDLE).any() or rate * bend >= 0.0:
+        return None
+    if abs(point.u[own]) > NEAR_DEAD_POINT:
         return None
     here = position_of(mechanism, q, name)
     limit = here + float(point.u[own] * geometry.unit[own])

@@ -196,6 +196,47 @@ def test_of_two_drives_that_at_its_dead_point_is_named() -> None:
     assert "the drive 'crank_right' is at its dead point" in solution.message
 
 
+def chain() -> tuple[srm.Mechanism, float]:
+    """A five-bar that stretches where its driven bar goes furthest, and the angle (rad) there, by
+    the law of cosines; its other bars move freely."""
+    A, B, C, D, E = points = np.array([(0, 0), (-0.5, 0.6), (0.2, 0.3), (0.9, 0.4), (1.4, 0)])
+    bars = {"left": "AB", "left_coupler": "BC", "right_coupler": "CD", "right": "DE"}
+    linkage = srm.planar(
+        points=dict(zip("ABCDE", map(tuple, points))),
+        bars={name: tuple(ends) for name, ends in bars.items()},
+        ground=("A", "E"),
+        mass_per_length=1.0,
+    )
+    driven, ground = np.linalg.norm(B - A), np.linalg.norm(E - A)
+    reach = sum(np.linalg.norm(b - a) for a, b in ((B, C), (C, D), (D, E)))
+    return linkage, math.acos((driven**2 + ground**2 - reach**2) / (2.0 * driven * ground))
+
+
+@on_both
+@pytest.mark.parametrize(("idle", "speed"), [(True, 1.0), (True, -1.0), (False, 1.0)])
+def test_a_dead_point_of_a_mechanism_with_further_freedom_is_named(
+    backend: str, idle: bool, speed: float
+) -> None:
+    """The slider-crank's rod spins, which moves nothing else; the five-bar is pulled straight."""
+    if idle:
+        mechanism, joint, limit = load("spatial_dead_point"), "rod", math.asin(2.0 / 2.5)
+    else:
+        mechanism, limit = chain()
+        joint = "A"
+    assert mechanism.degrees_of_freedom == 2
+    driven = replace(mechanism, drives=(srm.Drive(srm.ConstantSpeed(speed), joint),))
+    start = srm.assemble(driven, v=None)
+    driven = replace(driven, q0=start.q, v0=start.v)
+    assert dead_point(driven, 0.0, start.q) is None
+    with pytest.warns(FailedRunWarning):
+        solution = srm.simulate(driven, 6.0, backend=backend)
+    extreme, most = math.copysign(limit, speed), "most" if speed > 0.0 else "least"
+    assert (
+        f"the drive '{joint}' is at its dead point: the joint '{joint}' is at {extreme:.6g} rad, "
+        f"and the closures let it go to {extreme:.6g} rad at {most}. "
+    ) in solution.message
+
+
 def test_no_drive_is_at_a_dead_point_on_its_way_there_or_back() -> None:
     mechanism = rocker_linkage(3.0)
     end = largest_angle() / 3.0

@@ -2,7 +2,8 @@
 
 The bytes of a pickle depend on which equal objects are identical.  Here a value is divided as
 pickle does, and every part is hashed by its contents.  The fingerprint of a function covers its
-name, code, defaults, attributes and closure variables, not the functions that it calls.
+name, code, defaults, attributes and closure variables, not the functions that it calls or the
+global variables that it reads.
 
 ``joblib.hash`` would not do: it pickles functions by name, so that it does not notice a changed
 function and cannot hash a lambda, and it distinguishes lists from tuples and NumPy scalars from
@@ -23,8 +24,8 @@ import pinocchio as pin
 
 from srm_mbs.dynamics.mechanism import Mechanism
 
-_IGNORED_FIELDS = ("name", "source", "defaults", "notes", "points", "actuators")
-"""Fields of a mechanism that do not influence a run."""
+_IGNORED_FIELDS = ("name", "source", "defaults", "notes")
+"""Fields of a mechanism that influence neither a run nor what is measured of it."""
 
 
 def fingerprint(value: Any) -> str:

@@ -525,6 +525,22 @@ def test_the_file_of_another_sweep_is_refused(tmp_path: Path, four_bar: srm.Mech
     check_messages("sweep_files", messages)
 
 
+def test_a_measure_of_a_point_that_has_moved_is_not_read_from_the_file(
+    tmp_path: Path, four_bar: srm.Mechanism
+) -> None:
+    def measure(solution: srm.Solution) -> dict[str, float]:
+        return {"x": solution.point("tip").position[-1, 0]}
+
+    def swept(x: float) -> srm.Sweep:
+        moved = replace(four_bar, points={"tip": srm.Anchor("rocker", xyz=(x, 0.0, 0.0))})
+        return srm.sweep(moved, [{}], 0.1, measure=measure, resume=tmp_path / "sweep.jsonl")
+
+    swept(1.0)
+    assert swept(1.0).resumed == 1
+    with pytest.raises(srm.InputError, match="differs in mechanism"):
+        swept(0.5)
+
+
 def test_fingerprints_tell_values_apart_and_know_equal_ones() -> None:
     def adding(number: float) -> Callable[[float], float]:
         return lambda x: x + number

@@ -87,8 +87,8 @@ _FRAMES = """new Promise(resolve =>
 _FRONT = """html, body, #view { background: transparent !important; }
 canvas { visibility: hidden; }"""
 """Style of the page without its picture."""
-BARE = "#bar, #corner, .dg { display: none !important; }"
-"""Style of the page in images: no controls."""
+BARE = "#bar, #corner, .dg { display: none !important; } #panel { max-height: none !important; }"
+"""Style of the page in images: no controls, and nothing to be scrolled to."""
 
 
 @contextmanager

@@ -29,6 +29,7 @@ from srm_mbs.visualization.animation.overlays import (
 from srm_mbs.visualization.animation.page import SCRIPTS, make_page, page_data, values_over_time
 from srm_mbs.visualization.animation.scene import ASPECT, FIELD_OF_VIEW, FILLED_PART, make_picture
 from srm_mbs.visualization.animation.snapshot import draw_snapshot
+from srm_mbs.visualization.animation.video import BARE
 from tests.support.browsing import DRAWN, POINT_OF, exported, opened, placements
 from tests.support.bundled import load
 from tests.support.commands import run
@@ -546,6 +547,9 @@ def test_a_long_panel_is_scrolled_and_a_curve_has_the_digits_of_its_range(page: 
             "document.querySelector('#panel tr:last-child').getBoundingClientRect().bottom"
             " <= element('panel').getBoundingClientRect().bottom"
         )
+        bare = page.add_style_tag(content=BARE)  # pictures show all of it
+        page.wait_for_function("!element('panel').classList.contains('long')")
+        bare.evaluate("tag => tag.remove()")
         page.evaluate("choose('')")
     page.evaluate("about.values.splice(-40); lay_out()")
     page.set_viewport_size(before)

@@ -50,25 +50,29 @@ class Linkage(Mechanism):
         ------
         InputError
             If a file exists or cannot be written, or the linkage is not as :func:`planar` made
-            it: other forces, drives, closures or another state.
+            it: other forces, drives, closures, actuators, another name or state.
         """
         source = self.source
-        if source is None or not self._is_as_made(source):
+        changed = ["source"] if source is None else self._changed(source)
+        if source is None or changed:
             raise InputError(
-                "the linkage was changed after srm.planar made it",
+                f"the linkage was changed after srm.planar made it: {', '.join(changed)}",
                 element="save",
                 remedy="Give everything to srm.planar, or save a run of it",
             )
         description, urdf, _ = write_description(_reading(source), path, force=force)
         return description, urdf
 
-    def _is_as_made(self, source: Source) -> bool:
-        """Whether its texts still describe it."""
+    def _changed(self, source: Source) -> list[str]:
+        """Names of the fields that are not as its texts describe them."""
         made = assembled(_reading(source))
-        elements = ("loops", "forces", "drives", "friction_speed", "points", "model")
-        return all(getattr(self, name) == getattr(made, name) for name in elements) and bool(
-            np.array_equal(self.q0, made.q0) and np.array_equal(self.v0, made.v0)
-        )
+
+        def same(name: str) -> bool:
+            mine, own = getattr(self, name), getattr(made, name)
+            return bool(np.array_equal(mine, own) if name in ("q0", "v0") else mine == own)
+
+        names = [key.name for key in fields(made) if key.name not in ("source", "notes")]
+        return [name for name in names if not same(name)]
 
 
 def _reading(source: Source) -> Reading:

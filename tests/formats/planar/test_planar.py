@@ -618,8 +618,18 @@ def test_points_of_a_mechanism_are_on_its_links() -> None:
     assert replace(load("four_bar"), points={"tip": tip}).points == {"tip": tip}
 
 
-def test_a_linkage_that_was_changed_is_not_saved(tmp_path: Path) -> None:
-    linkage = made()
-    other = linkage.with_state(linkage.q0, 0.0 * linkage.v0 + 1.0)
-    with pytest.raises(srm.InputError, match="changed after"):
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"v0": np.ones(3)}, "v0"),
+        ({"actuators": {"motor": srm.Actuator("O")}}, "actuators"),
+        ({"name": "other", "forces": (srm.TorsionSpring("O", stiffness=1.0),)}, "forces, name"),
+    ],
+)
+def test_a_linkage_that_was_changed_is_not_saved(
+    tmp_path: Path, changes: dict[str, Any], named: str
+) -> None:
+    other = replace(made(), **changes)
+    with pytest.raises(srm.InputError, match=f"changed after srm.planar made it: {named}. Give"):
         other.save(tmp_path / "out.toml")
+    assert not list(tmp_path.iterdir())

@@ -491,6 +491,36 @@ def test_the_page_is_dark_where_the_browser_prefers_it_and_light_again(page: Any
     assert min(colours()) > 0.9
 
 
+COLOURS = """([name, ...attribute]) => {
+  const node = element(name), before = attribute.length && node.getAttribute(attribute[0]);
+  if (attribute.length) node.setAttribute(...attribute);
+  const { color, backgroundColor } = getComputedStyle(node);
+  if (attribute.length) node.setAttribute(attribute[0], before);
+  return [color, backgroundColor].map(text => text.match(/\\d+/g).map(Number));
+}"""
+
+
+def luminance(colour: list[int]) -> float:
+    """Relative luminance of sRGB (0 to 255), WCAG 2.2."""
+    parts = np.array(colour) / 255.0
+    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_on_coloured_ground_has_the_contrast_of_readable_text(page: Any, scheme: Any) -> None:
+    page.emulate_media(color_scheme=scheme)
+    for place in (
+        ("flash",),
+        ("show-curves", "aria-pressed", "true"),
+        ("unfold", "aria-expanded", "true"),
+    ):
+        low, high = sorted(map(luminance, page.evaluate(COLOURS, place)))
+        assert (high + 0.05) / (low + 0.05) >= 4.5, place
+    page.emulate_media(color_scheme="light")
+
+
 @pytest.mark.browser
 @pytest.mark.parametrize("size", [(1280, 720), (400, 760)])
 def test_nothing_covers_the_picture_or_leaves_the_window(page: Any, size: tuple[int, int]) -> None:

@@ -3,7 +3,7 @@
 The bytes of a pickle depend on which equal objects are identical.  Here a value is divided as
 pickle does, and every part is hashed by its contents.  The fingerprint of a function covers its
 name, code, defaults, attributes and closure variables, not the functions that it calls or the
-global variables that it reads.
+global variables that it reads; that of an object that can be called covers its ``__call__``, too.
 
 ``joblib.hash`` would not do: it pickles functions by name, so that it does not notice a changed
 function and cannot hash a lambda, and it distinguishes lists from tuples and NumPy scalars from
@@ -97,11 +97,16 @@ def _parts(value: Any) -> tuple[str, bytes | list[Any]]:
         case MethodType():
             return "method", [value.__func__, value.__self__]
         case CodeType():
-            return "code", [value.co_code, value.co_names, *value.co_consts]
+            # Cases are given by the names of arguments.
+            arguments = value.co_varnames[: value.co_argcount + value.co_kwonlyargcount]
+            code = [value.co_code, value.co_exceptiontable]
+            return "code", [*code, arguments, value.co_names, *value.co_consts]
     if is_dataclass(value):  # without cached attributes
         parts = [getattr(value, field.name) for field in fields(value)]
     else:
         parts = _reduced(value)
+    if callable(value) and isinstance(type(value).__call__, FunctionType):
+        parts.append(type(value).__call__)
     return f"object {_name(type(value))}", parts
 
 

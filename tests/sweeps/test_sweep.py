@@ -547,6 +547,7 @@ def test_fingerprints_tell_values_apart_and_know_equal_ones() -> None:
 
     different = [1, 1.0, True, "1", None, [1], [[1]], {"a": 1}, {"a": 2}, np.ones(1), adding(1.0)]
     different += [adding(2.0), lambda x: x - 1.0, srm.PSRM(), srm.PSRM(tableau="heun"), np.ones(2)]
+    different += [lambda a, b: a - b, lambda b, a: b - a]  # called with a=..., b=...
     prints = [fingerprint(value) for value in different]
     assert len(set(prints)) == len(prints)
     assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": np.int64(1)})
@@ -554,6 +555,17 @@ def test_fingerprints_tell_values_apart_and_know_equal_ones() -> None:
     used = srm.PSRM()
     srm.simulate(pendulum(), 0.1, method=used)
     assert fingerprint(used) == fingerprint(srm.PSRM())
+
+    class Scaled:
+        """A measure that is an object."""
+
+        def __call__(self, x: float) -> float:
+            return 2.0 * x
+
+    before = fingerprint(Scaled())
+    assert fingerprint(Scaled()) == before
+    Scaled.__call__ = lambda self, x: 3.0 * x  # type: ignore[method-assign]
+    assert fingerprint(Scaled()) != before
     looped: list[Any] = []
     looped.append(looped)
     assert fingerprint(looped) != fingerprint([[]])

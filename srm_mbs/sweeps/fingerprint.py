@@ -2,8 +2,9 @@
 
 The bytes of a pickle depend on which equal objects are identical.  Here a value is divided as
 pickle does, and every part is hashed by its contents.  The fingerprint of a function covers its
-name, code, defaults, attributes and closure variables, not the functions that it calls or the
-global variables that it reads; that of an object that can be called covers its ``__call__``, too.
+name, code, defaults, attributes, closure variables, and the global numbers, texts, tuples of these
+and mechanisms that it reads, not the functions that it calls; that of an object that can be called
+covers its ``__call__``, too.
 
 ``joblib.hash`` would not do: it pickles functions by name, so that it does not notice a changed
 function and cannot hash a lambda, and it distinguishes lists from tuples and NumPy scalars from
@@ -92,8 +93,8 @@ def _parts(value: Any) -> tuple[str, bytes | list[Any]]:
             return "named", _name(value).encode()
         case FunctionType():
             cells = [cell.cell_contents for cell in value.__closure__ or ()]
-            defaults = [value.__defaults__, value.__kwdefaults__]
-            return "function", [_name(value), value.__code__, value.__dict__, *defaults, *cells]
+            own = [value.__code__, value.__dict__, value.__defaults__, value.__kwdefaults__]
+            return "function", [_name(value), *own, _constants(value), *cells]
         case MethodType():
             return "method", [value.__func__, value.__self__]
         case CodeType():
@@ -108,6 +109,25 @@ def _parts(value: Any) -> tuple[str, bytes | list[Any]]:
     if callable(value) and isinstance(type(value).__call__, FunctionType):
         parts.append(type(value).__call__)
     return f"object {_name(type(value))}", parts
+
+
+def _constants(function: FunctionType) -> dict[str, Any]:
+    """The global constants that a function reads, by name."""
+    names: set[str] = set()
+    codes = [function.__code__]
+    while codes:
+        code = codes.pop()
+        names.update(code.co_names)
+        codes += [part for part in code.co_consts if isinstance(part, CodeType)]
+    found = {name: function.__globals__.get(name) for name in names if not name.startswith("__")}
+    return {name: value for name, value in found.items() if value is not None and _fixed(value)}
+
+
+def _fixed(value: Any) -> bool:
+    """Whether nothing changes a value: lists, for example, may count what was called."""
+    if isinstance(value, tuple | frozenset):
+        return all(map(_fixed, value))
+    return isinstance(value, bool | int | float | str | bytes | Mechanism)
 
 
 def _name(value: Any) -> str:

@@ -541,6 +541,25 @@ def test_a_measure_of_a_point_that_has_moved_is_not_read_from_the_file(
         swept(0.5)
 
 
+@pytest.mark.parametrize("other", ["LENGTH = 2.0", "SIZES = (1.0, 3.0)", "CALLS = [1]"])
+def test_fingerprints_of_functions_cover_the_constants_of_their_module(other: str) -> None:
+    code = (
+        "LENGTH, SIZES, CALLS = 1.0, (1.0, 2.0), []\n"
+        "def measure(x):\n"
+        "    CALLS.append(x)\n"
+        "    return [LENGTH * size for size in SIZES]\n"
+    )
+
+    def made(text: str) -> Any:
+        names: dict[str, Any] = {"__name__": "swept"}
+        exec(text, names)
+        return names["measure"]
+
+    same = other.startswith("CALLS")  # what may be changed by calls does not count
+    assert fingerprint(made(code)) == fingerprint(made(code))
+    assert (fingerprint(made(code + other)) == fingerprint(made(code))) is same
+
+
 def test_fingerprints_tell_values_apart_and_know_equal_ones() -> None:
     def adding(number: float) -> Callable[[float], float]:
         return lambda x: x + number

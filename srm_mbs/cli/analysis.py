@@ -126,7 +126,7 @@ def equilibrium(
     )
     table(equilibrium_rows(mechanism, found))
     echo("")
-    table(position_rows(mechanism, found.q), ("joint", "position"))
+    table(position_rows(mechanism, found.q), ("joint", "position", ""))
 
 
 @reported
@@ -272,7 +272,7 @@ def drag(
     echo("")
     table(
         position_rows(mechanism, found.q[-1] if found.complete else found.path[-1]),
-        ("joint", "position"),
+        ("joint", "position", ""),
     )
     _write_page(html, lambda: found.motion(duration))
     if not found.complete:

@@ -34,16 +34,19 @@ def _largest(values: Any) -> float:
     return float(np.max(np.abs(values), initial=0.0))
 
 
-def position_rows(mechanism: Mechanism, q: FloatArray) -> list[tuple[str, str]]:
-    """(joint, position with unit) in the configuration q (nq,)."""
-    return [(name, position_text(mechanism, name, q)) for name in mechanism.joint_names]
+def position_rows(mechanism: Mechanism, q: FloatArray) -> Iterator[tuple[str, str, str]]:
+    """(joint, position with unit, limit that it is beyond) in the configuration q (nq,)."""
+    beyond = beyond_limits(mechanism, q)
+    for name in mechanism.joint_names:
+        limit = f"beyond its limit {beyond[name][1]:.6g}" if name in beyond else ""
+        yield name, position_text(mechanism, name, q), limit
 
 
 def mode_rows(mechanism: Mechanism, modes: Sequence[AssemblyMode]) -> Iterator[tuple[str, ...]]:
     """(number, starts that led to it, whether it is singular or beyond joint limits, position of
     each joint) of each assembly mode."""
     for number, mode in enumerate(modes, 1):
-        positions = (text for _, text in position_rows(mechanism, mode.q))
+        positions = (text for _, text, _ in position_rows(mechanism, mode.q))
         remarks = ["singular"] * mode.singular
         if beyond := beyond_limits(mechanism, mode.q):
             remarks.append(f"beyond the limits of {', '.join(beyond)}")

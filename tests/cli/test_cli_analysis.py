@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
-from tests.support.commands import row, run
+from tests.cli.conftest import Describe
+from tests.support.commands import ROOT, row, run
 
 pytestmark = pytest.mark.filterwarnings("ignore:zmq.eventloop:DeprecationWarning")
 
@@ -42,6 +43,22 @@ def test_equilibrium_prints_stability_and_what_holds() -> None:
     assert row(held, "to hold crank") == f"{force[0]:.6g} N m"
     assert row(held, "crank") == "0.5 rad"
     assert "on a singular configuration" in run("equilibrium", "slider_crank")
+
+
+def test_positions_beyond_the_limits_of_their_joints_are_marked(
+    tmp_path: Path, describe: Describe
+) -> None:
+    bundled, own = ROOT / "urdf" / "four_bar.urdf", tmp_path / "limited.urdf"
+    head, crank = bundled.read_text(encoding="utf-8").split('<joint name="crank"')
+    own.write_text(f'{head}<joint name="crank"{crank.replace("1e6", "1.8", 2)}', encoding="utf-8")
+    path = describe((bundled.as_posix(), own.as_posix()))
+    dragged = run("drag", path, "crank=2.5")
+    assert re.split(" {2,}", row(dragged, "crank")) == ["2.5 rad", "beyond its limit 1.8"]
+    assert "beyond" not in row(dragged, "rocker")
+    assert "beyond" not in run("drag", path, "crank=1.5")
+    assert srm.equilibrium(srm.load(path)).q[0] < -1.8
+    assert row(run("equilibrium", path), "crank").endswith("beyond its limit -1.8")
+    assert run("modes", path, "--hold", "crank=-2.5").count("beyond the limits of crank") == 2
 
 
 NOISE = re.compile(r"(?<![\w.])-?[\d.]+e-(1[3-9]|[2-9]\d)")

@@ -1,9 +1,9 @@
 r"""Inverse dynamics on closures: the forces of chosen joints for a prescribed motion.
 
-With a basis N of the velocities that keep the loops closed, and the acceleration a_0 of the
-mechanism without actuators in the same state, M a + nle - forces = S^T tau - G^T lam becomes
+With a basis N of the velocities that keep the loops closed, M a + nle - forces = S^T tau - G^T lam
+becomes
 
-    N^T S^T tau = N^T M (a - a_0),
+    N^T S^T tau = N^T (M a + nle - forces),
 
 which does not contain the multipliers.  With more actuators than degrees of freedom, tau has least
 weighted norm.
@@ -21,11 +21,13 @@ import numpy as np
 from srm_mbs._typing import FloatArray, IndexArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
-from srm_mbs.dynamics.constraints.reactions import Reactions, reactions_at
+from srm_mbs.dynamics.constraints.reactions import Reactions
 from srm_mbs.dynamics.constraints.structure import structure_of
+from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.errors import InputError, counted, time_text
+from srm_mbs.integration.kernel.observables import make_observables
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import positive_number
@@ -205,11 +207,11 @@ def inverse_dynamics(
                 element="motion",
                 remedy="Leave this time out",
             )
-        own = system.evaluate(time, np.concatenate([q[i], v[i]])).rate()[nv:]
         geometry.closure(q[i])
-        inertia = basis.T @ geometry.mass()
-        right = inertia @ ((a[i] - own) / unit)
-        needed = max(needed, *np.abs(right), *np.abs(inertia @ (a[i] / unit)), 0.0)
+        inertial = geometry.mass() @ (a[i] / unit)
+        own = system.working_force(time, q[i], v[i]) + system.inertial_force(q[i], v[i])
+        right = basis.T @ (inertial - own * unit)
+        needed = max(needed, *np.abs(right), *np.abs(basis.T @ inertial), 0.0)
         reach = basis[columns].T * (unit[columns] / np.sqrt(weight))
         found = np.linalg.lstsq(reach, right, rcond=RANK_TOLERANCE)[0]
         torques[i] = found / np.sqrt(weight)
@@ -271,10 +273,7 @@ def _reactions(
     columns: IndexArray,
 ) -> Reactions:
     """The reactions at n states, with the forces (n, na)."""
-    acting = np.zeros(mechanism.model.nv)
-    system = make_system(mechanism, lambda t, q, v: acting)
-    parts = [reactions_at(system, times[:0], q[:0], v[:0])]
-    for i, own in enumerate(torques):
-        acting[columns] = own
-        parts.append(reactions_at(system, times[i : i + 1], q[i : i + 1], v[i : i + 1]))
-    return Reactions.joined(parts)
+    acting = np.zeros(v.shape)
+    acting[:, columns] = torques
+    system = make_system(mechanism, HeldForce())
+    return make_observables(system).reactions(times, q, v, acting)

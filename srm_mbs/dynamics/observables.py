@@ -231,15 +231,18 @@ class Observables:
         """
         return self.reactions(t, q, v).drives
 
-    def reactions(self, t: FloatArray, q: FloatArray, v: FloatArray) -> Reactions:
-        """Reactions of closures and joints, multipliers, and forces of drives.
+    def reactions(
+        self, t: FloatArray, q: FloatArray, v: FloatArray, forces: FloatArray | None = None
+    ) -> Reactions:
+        """Reactions of closures and joints, multipliers, and forces of drives; ``forces`` as for
+        :func:`~srm_mbs.dynamics.constraints.reactions.reactions_at`.
 
         Raises
         ------
         EvaluationError, ControllerError
             If the equations of motion cannot be evaluated.
         """
-        return reactions_at(self.system, t, q, v)
+        return reactions_at(self.system, t, q, v, forces)
 
     def accelerations(self, t: FloatArray, q: FloatArray, v: FloatArray) -> FloatArray:
         """v' (n, nv) of the equations of motion.

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.linalg import null_space
 
 import srm_mbs as srm
+from srm_mbs.analysis import inverse_dynamics
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
+from srm_mbs.dynamics.observables import Observables
+from srm_mbs.integration.kernel.observables import make_observables
 from tests.support.bundled import load
 from tests.support.mechanisms import floating_ring
 
@@ -138,6 +143,31 @@ def test_a_prescribed_crank_turns_uniformly() -> None:
     arrays = [times, *(np.array(part) for part in zip(*map(motion, times)))]
     same = srm.inverse_dynamics(mechanism, arrays, "crank")
     np.testing.assert_array_equal(same.torques, found.torques)
+
+
+@pytest.mark.parametrize("observables", [make_observables, Observables])
+def test_reactions_are_those_of_each_sample_alone(observables, monkeypatch) -> None:
+    """Two runs of a four-bar with a spring, whose samples have the same times, in one motion of
+    which the second half goes back in time."""
+    monkeypatch.setattr(inverse_dynamics, "make_observables", observables)
+    anchors = srm.Anchor("coupler"), srm.Anchor("world", xyz=(0.1, 0.0, 0.5))
+    spring = srm.SpringDamper(*anchors, 30.0, 2.0, 0.2, "spring")
+    mechanism = replace(load("four_bar"), forces=(spring,))
+    runs = [
+        srm.simulate(mechanism, 0.3, rtol=1e-10, controller=lambda t, q, v, k=k: [k, 0.0, 0.0])
+        for k in (1.0, -2.0)
+    ]
+    parts = [(run.t, run.q, run.v, run.accelerations) for run in runs]
+    motion = [np.concatenate([one, other[::-1]]) for one, other in zip(*parts)]
+    found = srm.inverse_dynamics(mechanism, motion, "crank")
+    np.testing.assert_allclose(
+        found.torques[:, 0], np.repeat([1.0, -2.0], [len(run.t) for run in runs]), atol=1e-8
+    )
+    for name in ("reactions", "reaction_multipliers", "joint_reactions"):
+        for key, own in getattr(found, name).items():
+            first, second = (getattr(run, name)[key] for run in runs)
+            expected = np.concatenate([first, second[::-1]])
+            np.testing.assert_allclose(own, expected, atol=1e-8 * np.abs(expected).max())
 
 
 def test_a_motion_given_as_a_function_may_be_read_at_no_time() -> None:

@@ -389,9 +389,10 @@ struct PySystem {
     }
 
     // Of n states: multipliers (n, rows), wrenches (n, closures, 6) and (n, joints, 6); see
-    // System::reactions.
+    // System::reactions.  At each state one of the `forces` (n, nv) is held from then on, if there
+    // are any.
     nb::tuple reactions(PySystem& all, const Array& scale, const std::vector<int>& kept,
-                        const Array& t, const Array& states) {
+                        const Array& t, const Array& states, std::optional<Array> forces) {
         const std::size_t n = count_of(t, states, state_size()), nx = state_size();
         const auto rows = static_cast<std::size_t>(all.system->rows());
         if (all.system.get() == system.get() || all.state_size() != state_size() ||
@@ -404,8 +405,11 @@ struct PySystem {
         const std::size_t closures = all.system->closure_count(), joints = system->joint_count();
         std::vector<double> lam(n * rows), on_b(6 * n * closures), on_child(6 * n * joints);
         const double *times = t.data(), *x = states.data(), *scales = scale.data();
+        if (forces) expect_size("forces", forces->size(), n * system->nv);
+        const double* const force = forces ? forces->data() : nullptr;
         const auto find = [&] {
             for (std::size_t i = 0; i < n; ++i) {
+                if (force) system->hold(-infinity, force + i * system->nv, false);
                 system->evaluate(times[i], x + i * nx, System::ZoneView{});
                 system->reactions(times[i], x + i * nx, *all.system, scales, kept,
                                   lam.data() + i * rows, on_b.data() + 6 * i * closures,
@@ -695,7 +699,7 @@ void bind_system(nb::module_& m) {
              nb::arg("loops"), nb::arg("in_units"), nb::arg("q"), nb::arg("spreads"))
         .def("drive_forces", &PySystem::drive_forces)
         .def("reactions", &PySystem::reactions, nb::arg("all"), nb::arg("scale"),
-             nb::arg("kept"), nb::arg("t"), nb::arg("states"))
+             nb::arg("kept"), nb::arg("t"), nb::arg("states"), nb::arg("forces").none())
         .def("accelerations", &PySystem::accelerations, nb::arg("t"), nb::arg("states"))
         .def("smallest_values", &PySystem::smallest_values)
         .def("largest_differences", &PySystem::largest_differences, nb::arg("from"), nb::arg("to"),

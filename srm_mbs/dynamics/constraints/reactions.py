@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import accumulate
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, cast
 
 import numpy as np
 import pinocchio as pin
@@ -40,6 +40,7 @@ from srm_mbs.dynamics.constraints.wrenches import (
     row_wrenches,
     sums_of_subtrees,
 )
+from srm_mbs.dynamics.controllers import HeldForce
 from srm_mbs.dynamics.forces import resolved_forces
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
@@ -90,8 +91,17 @@ class Reactions:
         )
 
 
-def reactions_at(system: _System, t: FloatArray, q: FloatArray, v: FloatArray) -> Reactions:
+def reactions_at(
+    system: _System,
+    t: FloatArray,
+    q: FloatArray,
+    v: FloatArray,
+    forces: FloatArray | None = None,
+) -> Reactions:
     """The reactions at n states q (n, nq), v (n, nv) at the times t (n,) s.
+
+    With ``forces`` (n, nv), N and N m, the held force of the ``system`` is one of them at each
+    state.
 
     Raises
     ------
@@ -99,10 +109,17 @@ def reactions_at(system: _System, t: FloatArray, q: FloatArray, v: FloatArray) -
         If the equations of motion cannot be evaluated at one of them.
     """
     blocks = [slice(i, i + BLOCK) for i in range(0, max(len(t), 1), BLOCK)]
-    return Reactions.joined([_block(system, t[own], q[own], v[own]) for own in blocks])
+    return Reactions.joined(
+        [
+            _block(system, t[own], q[own], v[own], None if forces is None else forces[own])
+            for own in blocks
+        ]
+    )
 
 
-def _block(system: _System, t: FloatArray, q: FloatArray, v: FloatArray) -> Reactions:
+def _block(
+    system: _System, t: FloatArray, q: FloatArray, v: FloatArray, held: FloatArray | None
+) -> Reactions:
     """:func:`reactions_at`, with all intermediate results in memory at once."""
     mechanism, n = system.mechanism, len(t)
     model = mechanism.model
@@ -111,7 +128,7 @@ def _block(system: _System, t: FloatArray, q: FloatArray, v: FloatArray) -> Reac
     inertial, loads = np.zeros((2, n, model.njoints, 6))
     placed = Placements.empty(model, n)
     data, forces = workspace(model), resolved_forces(mechanism)
-    for i, own, a in _multipliers(system, t, q, v):
+    for i, own, a in _multipliers(system, t, q, v, held):
         if own is not None:
             lam[i] = own
         pin.forwardKinematics(model, data, q[i], v[i])
@@ -184,7 +201,7 @@ def _names(mechanism: Mechanism) -> _Names:
 
 
 def _multipliers(
-    system: _System, t: FloatArray, q: FloatArray, v: FloatArray
+    system: _System, t: FloatArray, q: FloatArray, v: FloatArray, held: FloatArray | None
 ) -> Iterator[tuple[int, FloatArray | None, FloatArray]]:
     """Number of the state, lam (rows,) of all rows, unscaled, None for a mechanism without
     effective closures, and the acceleration v' (nv,)."""
@@ -194,6 +211,8 @@ def _multipliers(
     multipliers = np.empty((n, model.nv))
     closed = system.has_constraints
     for i in range(n):
+        if held is not None:
+            cast(HeldForce, system.held).only(held[i])
         terms = system.evaluate(t[i], np.concatenate([q[i], v[i]]))
         accelerations[i] = terms.rate()[model.nv :]
         if closed:

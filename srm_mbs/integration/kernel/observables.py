@@ -130,7 +130,7 @@ class CompiledObservables(Observables):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Without workspaces; a copy may be loaded where there is no kernel.
-        return _loaded, (self.system,)
+        return make_observables, (self.system,)
 
     @cached_property
     def idle(self) -> deque[Any]:
@@ -146,9 +146,9 @@ class CompiledObservables(Observables):
 
     @property
     def _calls_python(self) -> bool:
-        """Whether functions of the user act, or forces that a sampled controller held."""
+        """Whether functions of the user act."""
         system = self.system
-        return system.controlled or system.has_user_forces or system.held is not None
+        return system.has_user_forces or (system.controlled and system.held is None)
 
     def closure_errors(
         self, t: FloatArray, q: FloatArray, v: FloatArray
@@ -245,12 +245,14 @@ class CompiledObservables(Observables):
         with self.all_rows() as kernel_system:
             return kernel_system.energies(np.concatenate((q, v), axis=1))  # type: ignore[no-any-return]
 
-    def reactions(self, t: FloatArray, q: FloatArray, v: FloatArray) -> Reactions:
+    def reactions(
+        self, t: FloatArray, q: FloatArray, v: FloatArray, forces: FloatArray | None = None
+    ) -> Reactions:
         """As the reference, by one evaluation of each state; the reference itself where functions
         of the user act."""
         system = self.system
         if self._calls_python:
-            return super().reactions(t, q, v)
+            return super().reactions(t, q, v, forces)
         try:
             with workspace(system) as kernel_system, self.all_rows() as all_rows_system:
                 structure = self.mechanism.structure
@@ -259,9 +261,10 @@ class CompiledObservables(Observables):
                     structure.row_scale,
                     structure.kept_rows,
                     *_states(t, q, v),
+                    forces,
                 )
         except ArithmeticError:
-            return super().reactions(t, q, v)  # raises the error that says why
+            return super().reactions(t, q, v, forces)  # raises the error that says why
         return named_reactions(self.mechanism, lam, on_b.transpose(1, 0, 2), joints)
 
     def accelerations(self, t: FloatArray, q: FloatArray, v: FloatArray) -> FloatArray:
@@ -361,7 +364,8 @@ def _structs_of_dampers(mechanism: MechanismData) -> list[Any] | None:
     return [force_struct(**constants[0]) for constants in own]
 
 
-def _loaded(system: OpenSystem | ClosedSystem) -> Observables:
+def make_observables(system: OpenSystem | ClosedSystem) -> Observables:
+    """Those of ``system`` by the kernel, if it is there."""
     return (Observables if core is None else CompiledObservables)(system)
 
 

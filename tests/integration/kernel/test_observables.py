@@ -13,6 +13,7 @@ import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints import row_algebra
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry, geometry_of, separated_pattern
+from srm_mbs.dynamics.constraints.reactions import Reactions
 from srm_mbs.dynamics.constraints.row_algebra import SingularValues
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.dynamics.observables import Observables
@@ -350,6 +351,12 @@ def assert_same_reactions(mechanism: srm.Mechanism, tolerance: float = 1e-9) -> 
     """Compare the reactions along a run, relative to the largest one."""
     run = srm.simulate(mechanism, 0.005)
     compiled, reference = (each.reactions(run.t, run.q, run.v) for each in both(mechanism))
+    assert_equal_reactions(compiled, reference, tolerance)
+    a, b = (each.accelerations(run.t, run.q, run.v) for each in both(mechanism))
+    np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-10 * np.abs(b).max())
+
+
+def assert_equal_reactions(compiled: Reactions, reference: Reactions, tolerance: float) -> None:
     for key in ("closures", "multipliers", "drives", "joints"):
         found, expected = getattr(compiled, key), getattr(reference, key)
         assert list(found) == list(expected)
@@ -357,8 +364,21 @@ def assert_same_reactions(mechanism: srm.Mechanism, tolerance: float = 1e-9) -> 
         for name, own in expected.items():
             assert found[name].shape == own.shape
             np.testing.assert_allclose(found[name], own, rtol=0.0, atol=tolerance * size)
-    a, b = (each.accelerations(run.t, run.q, run.v) for each in both(mechanism))
-    np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-10 * np.abs(b).max())
+
+
+def test_reactions_under_held_forces_are_those_of_the_reference() -> None:
+    """Samples every 0.1 s; times of the run in any order, also those of samples."""
+    mechanism = load("four_bar")
+    run = srm.simulate(
+        mechanism, 0.5, controller=lambda t, q, v: [3.0 - 9.0 * t, -v[1], 2.0], sample_time=0.1
+    )
+    at = run.at(np.array([0.3, 0.12, 0.1, 0.45, 0.0, 0.3]))
+    compiled, reference = CompiledObservables(run.system), Observables(run.system)
+    expected = reference.reactions(at.t, at.q, at.v)
+    assert_equal_reactions(compiled.reactions(at.t, at.q, at.v), expected, 1e-12)
+    same(compiled.accelerations(at.t, at.q, at.v), reference.accelerations(at.t, at.q, at.v))
+    without = Observables(make_system(mechanism)).reactions(at.t, at.q, at.v)
+    assert np.abs(without.closures["pin"] - expected.closures["pin"]).max() > 0.1
 
 
 @pytest.mark.parametrize("name", [*DISTINCT_MODELS, "n_four_bar_12"])

@@ -139,6 +139,8 @@ class Simulator:
         metered = self._backend == "kernel" and backend == "auto" and code_is_compiled()
         self._charge_every = CHARGED if metered else math.inf
         self._no_force = np.zeros(mechanism.model.nv)
+        # Start (s), length (s), number and end (s) of the last steps of equal length.
+        self._equal_steps: tuple[float, float, int, float] = 0.0, math.nan, 0, 0.0
         self._make()
         self.reset()
 
@@ -196,8 +198,8 @@ class Simulator:
         Parameters
         ----------
         dt
-            Positive; need not be the same every time.  One that is within rounding of ``t`` moves
-            the time only.
+            Positive; need not be the same every time.  Equal ones add up without rounding: k of
+            them from t_0 end at t_0 + k dt.  One within rounding of ``t`` moves the time only.
         tau : (nv,) or {joint: force}
             Generalised forces held during the step, N and N m, beside those of the mechanism;
             none by default.  A mapping is that of a controller: joints that it does not name have
@@ -221,7 +223,7 @@ class Simulator:
         dt = positive_number(dt, "dt", " of seconds")
         force = self._no_force if tau is None else self._force(tau)
         run, t = self._run, self.t
-        end = t + dt
+        end = self._end_of_step(t, dt)
         if dt <= NEGLIGIBLE_DT * math.ulp(t):
             return self._move_time(t, end, dt)
         if dt > RESTART_GROWTH * self._last_dt:
@@ -255,6 +257,17 @@ class Simulator:
                 self._charge()
         state = run.state
         return state[: self._nq], state[self._nq :]
+
+    def _end_of_step(self, t: float, dt: float) -> float:
+        """End (s) of a step ``dt`` (s) from ``t`` (s): k equal ones from t_0 end at t_0 + k dt, so
+        that the rounding of times does not add up."""
+        start, length, count, end = self._equal_steps
+        if dt != length or t != end:
+            start, count = t, 0
+        count += 1
+        end = start + count * dt
+        self._equal_steps = start, dt, count, end
+        return end
 
     def _move_time(self, t: float, end: float, dt: float) -> tuple[FloatArray, FloatArray]:
         """Go on from ``t`` to ``end`` (s) in the same state: a step ``dt`` (s) within rounding.
@@ -379,6 +392,7 @@ class Simulator:
             state = self._consistent(q, v, t, project)
         self._pending_start = t, state
         self._last_dt = math.inf
+        self._equal_steps = t, math.nan, 0, t
         self._forces.clear()
         self._busy = False
         return self.q, self.v

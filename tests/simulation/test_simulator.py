@@ -179,6 +179,29 @@ def test_steps_within_rounding_move_the_time_and_spoil_nothing(
 
 
 @on_both
+def test_the_rounding_of_times_does_not_add_up_over_equal_steps(
+    slider_crank: srm.Mechanism, backend: str
+) -> None:
+    """Ten times 0.1 adds up to 1 - 1.1e-16, a hundred times to 10 - 2e-14."""
+    simulator = srm.Simulator(slider_crank, rtol=1e-3, backend=backend)
+    simulator.reset(t=2.0)
+    for _ in range(100):
+        simulator.step(0.1)
+    assert simulator.t == 12.0
+    simulator.step(12.7 - simulator.t)
+    assert simulator.t == 12.7
+    for _ in range(50):
+        simulator.step(0.1)
+    copy = simulator.clone()
+    for each in (simulator, copy):
+        for _ in range(50):
+            each.step(0.1)
+        assert each.t == 12.7 + 100 * 0.1
+    copy.reset(t=12.7)
+    assert copy.t == 12.7
+
+
+@on_both
 def test_times_are_of_double_precision_whatever_the_type_of_a_step(
     slider_crank: srm.Mechanism, backend: str
 ) -> None:

@@ -1,6 +1,6 @@
 """Causes of failures that a reader can act on: controllers that are unstable or no functions of the
-state, drives at their dead points, and starts at positions so large that their rounding exceeds
-what closures are held to.
+state, joints that move no inertia, drives at their dead points, and starts at positions so large
+that their rounding exceeds what closures are held to.
 
 A run fails where its steps fail, and says so; these causes come first in its message.
 """
@@ -10,7 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import pinocchio as pin
 
+from srm_mbs._kernel.workspace import workspace
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.geometry import ClosureGeometry
 from srm_mbs.dynamics.constraints.local_coordinates import ChartPoint, TangentChart, tangent_basis
@@ -21,10 +23,11 @@ from srm_mbs.dynamics.scaling import (
     rotating_coordinates,
     start_rounding,
 )
-from srm_mbs.errors import ControllerError, safe_repr
+from srm_mbs.errors import ControllerError, joined_names, safe_repr
 from srm_mbs.integration.messages import FailureCause
 from srm_mbs.model.coordinates import free_coordinates, joint_coordinates, position_of
 from srm_mbs.model.drives import Drive
+from srm_mbs.model.validation import ARTICULATED_INERTIA_TOLERANCE
 
 REVERSALS, RUNAWAY_REVERSALS = 3, 2
 """Samples in a row at which a force grows and changes its sign, from which it counts as one that
@@ -42,6 +45,8 @@ FLAT = 1e-9
 """Slope of a coordinate along the motion that is zero."""
 IDLE = 1e-5
 """Second derivative of a coordinate, over the largest, along freedoms that do not move it."""
+MOVING_PART = 0.1
+"""Part of a coordinate in a motion, over the largest, from which its joint takes part."""
 COARSE = 1e-10
 """Rounding of a position, over its unit, from which it may be what a run fails by: a hundred times
 the largest closure error of a start."""
@@ -228,6 +233,27 @@ def _dead_point_of(
     )
 
 
+def inertialess_motion(mechanism: Mechanism, q: FloatArray) -> FailureCause | None:
+    """The joints that move together without inertia at ``q`` (nq,), as those on both sides of
+    massless links do where their axes coincide; None if there are none."""
+    M = pin.crba(mechanism.model, workspace(mechanism.model), q)
+    M = np.triu(M) + np.triu(M, 1).T
+    size = np.sqrt(M.diagonal())
+    if not (np.isfinite(M).all() and (size > 0.0).all()):
+        return None
+    inertias, motions = np.linalg.eigh(M / size / size[:, None])
+    if inertias[0] >= ARTICULATED_INERTIA_TOLERANCE:
+        return None
+    part = np.abs(motions[:, 0])
+    moving = np.flatnonzero(part > MOVING_PART * part.max()).tolist()
+    joints = joined_names(dict.fromkeys(safe_repr(_joint_of(mechanism, i)) for i in moving))
+    return FailureCause(
+        f"a motion of the joints {joints} moves no inertia there, as where the axes on both sides "
+        "of massless links coincide: no force determines it",
+        "Give the links between these joints inertia, or make them one ball joint",
+    )
+
+
 def rounding_clause(mechanism: Mechanism, rounding: PositionRounding) -> str:
     """Which initial position is known how closely, as a clause."""
     name = _joint_of(mechanism, rounding.coordinate)
@@ -257,4 +283,9 @@ def failure_cause(
     """The cause of a failure at ``t`` (s) and ``q`` (nq,), under the forces that ``watch`` saw;
     None if it is none of those that are known."""
     cause = None if watch is None else watch.cause()
-    return cause or dead_point(mechanism, t, q) or coarse_start(mechanism)
+    return (
+        cause
+        or inertialess_motion(mechanism, q)
+        or dead_point(mechanism, t, q)
+        or coarse_start(mechanism)
+    )

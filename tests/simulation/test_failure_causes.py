@@ -10,11 +10,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
 from srm_mbs.errors import FailedRunWarning
-from srm_mbs.simulation.failure_causes import dead_point
+from srm_mbs.simulation.failure_causes import dead_point, inertialess_motion
 from tests.support.backends import on_both
 from tests.support.bundled import load
 
@@ -247,3 +248,22 @@ def test_no_drive_is_at_a_dead_point_on_its_way_there_or_back() -> None:
     q, _ = way(t)
     assert dead_point(mechanism, t, q) is not None
     assert dead_point(rocker_linkage(-3.0), t, q) is None
+
+
+@on_both
+def test_joints_that_move_no_inertia_are_the_cause_that_a_run_names(backend: str) -> None:
+    """Three hinges of massless links carry a body; friction leads it to where two axes coincide."""
+    model = pin.Model()
+    joints = {"yaw": pin.JointModelRZ(), "pitch": pin.JointModelRY(), "roll": pin.JointModelRZ()}
+    for k, (name, joint) in enumerate(joints.items()):
+        model.addJoint(k, joint, pin.SE3.Identity(), name)
+    body = pin.Inertia(1.0, np.array([0.0, 0.0, -0.3]), np.diag([0.02, 0.03, 0.01]))
+    model.appendBodyToJoint(3, body, pin.SE3.Identity())
+    model.friction = np.full(3, 0.2)
+    start: dict[str, Any] = {"q0": np.array([0.0, 0.3, 0.1]), "v0": np.array([3.0, -1.0, 0.0])}
+    mechanism = srm.Mechanism(model=model, loops=(), **start)
+    with pytest.warns(FailedRunWarning):
+        run = srm.simulate(mechanism, 1.0, backend=backend)
+    assert abs(run.q[-1, 1]) < 1e-5
+    assert "a motion of the joints 'yaw', 'roll' moves no inertia there" in run.message
+    assert inertialess_motion(mechanism, np.array([0.0, 0.01, 0.0])) is None

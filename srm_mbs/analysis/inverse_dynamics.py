@@ -207,7 +207,6 @@ def inverse_dynamics(
                 element="motion",
                 remedy="Leave this time out",
             )
-        geometry.closure(q[i])
         inertial = geometry.mass() @ (a[i] / unit)
         own = system.working_force(time, q[i], v[i]) + system.inertial_force(q[i], v[i])
         right = basis.T @ (inertial - own * unit)

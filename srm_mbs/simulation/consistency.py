@@ -1,8 +1,10 @@
-"""Consistency of states with closures and drives: the check of starts, and the ends of runs.
+"""Consistency of states with closures and drives: the starts of runs, and their ends.
 
-The correction at the end of a step closes the loops up to the square of what it corrects, so the
-end of a run with a loose tolerance may be farther from the closures than a start is allowed to be.
-:func:`closed_end` moves it onto them, so that another run can start there.
+The correction at the end of a step closes the loops up to the square of what it corrects, and dense
+output lies within the tolerance of the closures, so states of a run may be farther from them than
+:data:`CONSISTENT`.  A run may start at such states of another one all the same:
+:func:`closed_start` moves a start onto the closures if its tolerance allows that,
+:func:`closed_end` the end of a run, from where one with any tolerance may go on.
 """
 
 from __future__ import annotations
@@ -20,12 +22,18 @@ from srm_mbs.dynamics.scaling import Units, constraint_units
 from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import closure_errors, largest_errors
+from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.integration.methods.branch_nodes import onto_closed_branch
+from srm_mbs.integration.methods.near_singular import AMBIGUOUS_DISTANCE, WATCHED_SIGMA
 from srm_mbs.model.mechanism import per_start
 from srm_mbs.model.validation import START_ARGUMENTS
 
 CONSISTENT = 1e-8
-"""Largest closure error of an accepted start, in row units, and of its rates in those per time."""
+"""Closure error of a start, in row units, and of its rates in those per time, up to which it stays
+as it is."""
+LARGEST_MOVE = 10.0
+"""Largest motion of a start onto the closures, over the tolerance of the run: that of dense output
+with loose tolerances."""
 MAY_VIOLATE = 0.1
 """Part of CONSISTENT in the units of the start of a run, from which it may be more in those of its
 end."""
@@ -109,19 +117,105 @@ def check_consistent(
     InputError
         Naming the row that is violated most.
     """
+    found = _violated(mechanism, t, backend, system)
+    if found is not None:
+        raise _refusal(mechanism, t, found, names)
+
+
+def closed_start(
+    mechanism: Mechanism,
+    t: float,
+    norm: ErrorNorm,
+    backend: str = "python",
+    system: OpenSystem | ClosedSystem | None = None,
+    names: tuple[str, str] = START_ARGUMENTS,
+) -> FloatArray:
+    """The state (nq + nv,) on the closures and drives in which a run of ``mechanism`` starts.
+
+    It is the initial state itself (``mechanism.start_state``) up to :data:`CONSISTENT`.  Beyond, it
+    is that moved along the normals, velocities by the M-orthogonal projection, if the motion is at
+    most :data:`LARGEST_MOVE` of the tolerance in ``norm``, that of the run.
+
+    Parameters
+    ----------
+    mechanism, t, backend, system, names
+        As for :func:`check_consistent`.
+
+    Raises
+    ------
+    InputError
+        For another start, naming the row that is violated most, and for one so close to a singular
+        configuration that the motion might lead to another branch.
+    """
+    found = _violated(mechanism, t, backend, system)
+    state = mechanism.start_state
+    if found is None:
+        return state
+    also, near_singular = "", False
+    with suppress(EvaluationError):
+        closures = make_system(mechanism)  # functions of the user are not called
+        closed = onto_closed_branch(closures, t, state)
+        move = closures.difference(state, closed)
+        size = norm(move, norm.weights(closures.state_scale(state)))
+        distance, sigma = closures.position_norm(move), closures.evaluate(t, state).sigma
+        if size > LARGEST_MOVE:
+            also = (
+                f"; the way onto them is {size:.2g} times the tolerance of the run "
+                f"(at most {LARGEST_MOVE:g})"
+            )
+        elif distance > AMBIGUOUS_DISTANCE * sigma:
+            near_singular = sigma < WATCHED_SIGMA
+            if near_singular:
+                also = (
+                    ", which leaves its branch open next to a singular configuration "
+                    f"(sigma = {sigma:.0e})"
+                )
+        else:
+            there = mechanism.moved(*closures.split(closed))
+            if _violated(there, t, backend) is None:
+                return closed
+    raise _refusal(mechanism, t, found, names, also, near_singular)
+
+
+def _violated(
+    mechanism: Mechanism, t: float, backend: str, system: OpenSystem | ClosedSystem | None = None
+) -> Violation | None:
+    """:func:`largest_violation` of the initial state, which is remembered to have none."""
     accepted = _accepted_times(mechanism)
     if t in accepted:
-        return
+        return None
     found = largest_violation(mechanism, t, mechanism.q0, mechanism.v0, backend, system)
-    if found is not None:
-        rows = mechanism.structure.row_names
-        kind = "drives" if found.row >= len(rows) - len(mechanism.drives) else "closures"
-        raise InputError(
-            f"the initial state violates the {kind}: row {rows[found.row]} by {found.value:.1e}",
-            element=names[found.rate],
-            remedy="Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v",
+    if found is None:
+        accepted.add(t)
+    return found
+
+
+def _refusal(
+    mechanism: Mechanism,
+    t: float,
+    found: Violation,
+    names: tuple[str, str],
+    also: str = "",
+    near_singular: bool = False,
+) -> InputError:
+    """The error about the violation ``found`` of a start at ``t`` (s); ``also`` says more of it."""
+    rows = mechanism.structure.row_names
+    kind = "drives" if found.row >= len(rows) - len(mechanism.drives) else "closures"
+    q, v = names
+    at = f", {t!r}" if t else ""
+    projected = f"srm.Simulator(mechanism).reset({q}, {v}{at}, project=True)"
+    remedy = "Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v"
+    if near_singular:
+        remedy = (
+            f"Start at another time of the motion, or on the branch of {v}: {projected} returns it"
         )
-    accepted.add(t)
+    elif mechanism.drives and t:  # where drives lead to by then, assembly does not know
+        remedy = f"Use {projected}, which returns a consistent q and v"
+    return InputError(
+        f"the initial state violates the {kind}: row {rows[found.row]} by {found.value:.1e}{also}",
+        element=names[found.rate],
+        remedy=remedy,
+    )
 
 
 def closed_end(

@@ -19,12 +19,13 @@ from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.scaling import Units, constraint_units
+from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import closure_errors, largest_errors
 from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.integration.methods.branch_nodes import onto_closed_branch
-from srm_mbs.integration.methods.near_singular import AMBIGUOUS_DISTANCE, WATCHED_SIGMA
+from srm_mbs.integration.methods.near_singular import WATCHED_SIGMA
 from srm_mbs.model.mechanism import per_start
 from srm_mbs.model.validation import START_ARGUMENTS
 
@@ -34,6 +35,11 @@ as it is."""
 LARGEST_MOVE = 10.0
 """Largest motion of a start onto the closures, over the tolerance of the run: that of dense output
 with loose tolerances."""
+CLOSED = 1e-12
+"""Closure error, in row units, up to which a moved start is on the closures."""
+OPEN_DISTANCE = 0.05
+"""Motion of a start onto the closures, over sigma, above which it may belong to another branch: in
+narrow layers Newton's method led to that from 0.09 on."""
 MAY_VIOLATE = 0.1
 """Part of CONSISTENT in the units of the start of a run, from which it may be more in those of its
 end."""
@@ -155,22 +161,25 @@ def closed_start(
     with suppress(EvaluationError):
         closures = make_system(mechanism)  # functions of the user are not called
         closed = onto_closed_branch(closures, t, state)
+        # Nodes of a branch lead straight on, also where branches almost cross.
+        if closures.constraint_residual(t, closed) > CLOSED:
+            closed = onto_closures(closures, t, state)
         move = closures.difference(state, closed)
         size = norm(move, norm.weights(closures.state_scale(state)))
         distance, sigma = closures.position_norm(move), closures.evaluate(t, state).sigma
-        if size > LARGEST_MOVE:
+        is_open = distance > OPEN_DISTANCE * sigma
+        near_singular = is_open and sigma < WATCHED_SIGMA
+        if near_singular:
+            also = (
+                ", which leaves its branch open next to a singular configuration "
+                f"(sigma = {sigma:.0e})"
+            )
+        elif size > LARGEST_MOVE:
             also = (
                 f"; the way onto them is {size:.2g} times the tolerance of the run "
                 f"(at most {LARGEST_MOVE:g})"
             )
-        elif distance > AMBIGUOUS_DISTANCE * sigma:
-            near_singular = sigma < WATCHED_SIGMA
-            if near_singular:
-                also = (
-                    ", which leaves its branch open next to a singular configuration "
-                    f"(sigma = {sigma:.0e})"
-                )
-        else:
+        elif not is_open:
             there = mechanism.moved(*closures.split(closed))
             if _violated(there, t, backend) is None:
                 return closed

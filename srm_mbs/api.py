@@ -477,7 +477,8 @@ def solve_dae(
     t_span : (t0, t1)
         Start and end.
     x0 : (nx,)
-        Initial state, with g(t0, x0) = 0.
+        Initial state, with g(t0, x0) = 0; up to ten times the tolerance it is moved there, so that
+        any state of a run of the same tolerance will do.
     method
         ``"psrm"`` (split), ``"srm"`` or a method object.  The T of its sweeps is I, (GB)^T, or
         (GB)^-1; the last one carries B y, form (2.4) of the thesis.  Isolated singularities of

@@ -19,7 +19,7 @@ from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.scaling import Units, constraint_units
-from srm_mbs.dynamics.system import onto_closures
+from srm_mbs.dynamics.system import System, onto_closures
 from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import closure_errors, largest_errors
@@ -107,6 +107,44 @@ def _accepted_times(mechanism: Mechanism) -> set[float]:
     return set()
 
 
+class Motion(NamedTuple):
+    """The motion of a start onto the closures.
+
+    Attributes
+    ----------
+    size
+        Norm, over the tolerance of the run.
+    sigma
+        sigma at the start.
+    is_open
+        Whether the start may belong to another branch than that to which the motion leads.
+    """
+
+    size: float
+    sigma: float
+    is_open: bool
+
+    @classmethod
+    def of(
+        cls, system: System, t: float, state: FloatArray, closed: FloatArray, norm: ErrorNorm
+    ) -> Motion:
+        """That of ``state`` (nx,) at ``t`` (s) to ``closed`` (nx,)."""
+        move = system.difference(state, closed)
+        sigma = system.evaluate(t, state).sigma
+        is_open = system.position_norm(move) > OPEN_DISTANCE * sigma
+        return cls(norm(move, norm.weights(system.state_scale(state))), sigma, is_open)
+
+    @property
+    def is_near_singular(self) -> bool:
+        """Whether that is so because a singular configuration is near."""
+        return self.is_open and self.sigma < WATCHED_SIGMA
+
+    @property
+    def size_text(self) -> str:
+        """The size, for messages."""
+        return f"{self.size:.2g} times the tolerance of the run (at most {LARGEST_MOVE:g})"
+
+
 def check_consistent(
     mechanism: Mechanism,
     t: float = 0.0,
@@ -164,22 +202,16 @@ def closed_start(
         # Nodes of a branch lead straight on, also where branches almost cross.
         if closures.constraint_residual(t, closed) > CLOSED:
             closed = onto_closures(closures, t, state)
-        move = closures.difference(state, closed)
-        size = norm(move, norm.weights(closures.state_scale(state)))
-        distance, sigma = closures.position_norm(move), closures.evaluate(t, state).sigma
-        is_open = distance > OPEN_DISTANCE * sigma
-        near_singular = is_open and sigma < WATCHED_SIGMA
+        motion = Motion.of(closures, t, state, closed, norm)
+        near_singular = motion.is_near_singular
         if near_singular:
             also = (
                 ", which leaves its branch open next to a singular configuration "
-                f"(sigma = {sigma:.0e})"
+                f"(sigma = {motion.sigma:.0e})"
             )
-        elif size > LARGEST_MOVE:
-            also = (
-                f"; the way onto them is {size:.2g} times the tolerance of the run "
-                f"(at most {LARGEST_MOVE:g})"
-            )
-        elif not is_open:
+        elif motion.size > LARGEST_MOVE:
+            also = f"; the way onto them is {motion.size_text}"
+        elif not motion.is_open:
             there = mechanism.moved(*closures.split(closed))
             if _violated(there, t, backend) is None:
                 return closed

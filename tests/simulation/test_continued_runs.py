@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from typing import Any
 
 import numpy as np
@@ -207,3 +209,38 @@ def test_a_state_is_projected_after_thousands_of_turns(backend: str) -> None:
         at, _ = simulator.reset(q, mechanism.v0, project=True)
         assert np.abs(at - q).max() < 1e-4
         assert np.abs(mechanism.with_state(at, mechanism.v0).initial_errors[0]).max() < 1e-10
+
+
+def _circle() -> srm.SemiExplicitDAE:
+    """A point on the unit circle with the angle t + (1 - cos 3t)/6."""
+
+    def f(t: float, x: Any) -> Any:
+        rate = 1.0 + 0.5 * np.sin(3.0 * t)
+        return np.array([x[0] - rate * x[1], rate * x[0] + x[1]])
+
+    return srm.SemiExplicitDAE(
+        f=f, B=lambda t, x: x, g=lambda t, x: 0.5 * (x @ x - 1.0), G=lambda t, x: x
+    )
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-5])
+def test_a_run_of_a_dae_starts_in_any_state_of_another_one(rtol: float) -> None:
+    angle = 5.0 + (1.0 - np.cos(15.0)) / 6.0
+    whole = srm.solve_dae(_circle(), (0.0, 5.0), [1.0, 0.0], rtol=rtol)
+    moved = 0
+    for t in np.linspace(0.1, 4.9, 7):
+        x, _ = whole(t)
+        rest = srm.solve_dae(_circle(), (t, 5.0), x, rtol=rtol)
+        moved += not np.array_equal(rest.x[0], x)
+        assert np.abs(rest.x[0] - x).max() < rtol
+        assert np.abs(rest.x[-1] - [np.cos(angle), np.sin(angle)]).max() < 0.3 * rtol
+    assert moved
+
+
+def test_the_start_of_a_dae_is_refused_beyond_the_tolerance_with_one_that_fits() -> None:
+    for off, t in ((1.02, 0.3), (1.2, 2.0)):
+        with pytest.raises(srm.InputError, match="times the tolerance of the run") as refused:
+            srm.solve_dae(_circle(), (t, t + 0.1), [0.0, off], rtol=1e-4)
+        found = re.search(r"constraints: (\[.*\]) is on them", str(refused.value))
+        assert found
+        assert srm.solve_dae(_circle(), (t, t + 0.1), json.loads(found[1]), rtol=1e-4).success

@@ -197,7 +197,7 @@ def closed_start(
         return state
     also, near_singular = "", False
     with suppress(EvaluationError):
-        closures = make_system(mechanism)  # functions of the user are not called
+        closures = make_system(mechanism)  # the controller is not called
         closed = onto_closed_branch(closures, t, state)
         # Nodes of a branch lead straight on, also where branches almost cross.
         if closures.constraint_residual(t, closed) > CLOSED:
@@ -283,6 +283,6 @@ def closed_end(
         if violated(None, MAY_VIOLATE * CONSISTENT) and violated(
             mechanism.with_state(q, v).structure.units, CONSISTENT
         ):
-            # Functions of the user are not called again.
+            # The controller is not called again.
             return onto_closed_branch(make_system(mechanism), t, state)
     return state

@@ -342,7 +342,11 @@ def simulate(
         Start of the run (s).  Drives count from 0: ``q0`` and ``v0`` are then a state of the
         motion that they prescribe from the mechanism's own initial state.
     q0 : (nq,), v0 : (nv,)
-        Initial state instead of the mechanism's own; must satisfy the closures.
+        Initial state instead of the mechanism's own.  It satisfies the closures and their rates to
+        1e-8 (in rad and scene diagonals, and those over the characteristic time), or is moved onto
+        them as at the end of a step, by at most ten times the tolerance in the norm of the error
+        control: any state of a run of the same tolerance will do, of dense output as well.  The
+        motion begins at ``solution.q[0]``, ``solution.v[0]``.  Other states are refused.
     method
         ``"psrm"``, ``"srm"`` or a method object: :class:`srm_mbs.PSRM`, :class:`srm_mbs.SRM`.
     tableau
@@ -473,7 +477,8 @@ def solve_dae(
     t_span : (t0, t1)
         Start and end.
     x0 : (nx,)
-        Initial state, with g(t0, x0) = 0.
+        Initial state, with g(t0, x0) = 0; up to ten times the tolerance it is moved there, so that
+        any state of a run of the same tolerance will do.
     method
         ``"psrm"`` (split), ``"srm"`` or a method object.  The T of its sweeps is I, (GB)^T, or
         (GB)^-1; the last one carries B y, form (2.4) of the thesis.  Isolated singularities of

@@ -650,6 +650,10 @@ class DaeSystem:
         """max |dx| over the units; see :class:`~srm_mbs.dynamics.system.System`."""
         return float((np.abs(delta) / (self._scale * self._unit)).max())
 
+    def position_rounding(self, state: FloatArray) -> float:
+        """That of x; see :class:`~srm_mbs.dynamics.system.System`."""
+        return self.position_norm(np.spacing(np.abs(state)))
+
     def reachable(self, start: FloatArray, end: FloatArray) -> bool:
         """True: there is one chart."""
         return True

@@ -279,6 +279,12 @@ class Manifold:
         # A list: the largest of a few numbers, for which NumPy takes five times as long.
         return float(max(map(abs, (delta[: self.nv] / self._unit).tolist())))
 
+    def position_rounding(self, state: FloatArray) -> float:
+        """That of coordinates that are numbers; see :class:`~srm_mbs.dynamics.system.System`."""
+        vector = self._position_of >= 0
+        q = np.abs(state[self._position_of[vector]])
+        return float((np.spacing(q) / self._unit[vector]).max(initial=0.0))
+
     def state_scale(self, state: FloatArray) -> FloatArray:
         """min(|q|, unit) per coordinate (the unit itself on a group), then |v|.
 

@@ -269,6 +269,9 @@ class System(Protocol):
     def position_norm(self, delta: FloatArray) -> float:
         """Largest motion of the positions in ``delta``, in units (rad, scene diagonals)."""
 
+    def position_rounding(self, state: FloatArray) -> float:
+        """Largest distance of a position from the next floating-point number, in units."""
+
     def state_scale(self, state: FloatArray) -> FloatArray:
         """|x_i| of the error weights, per tangent component."""
 
@@ -346,6 +349,8 @@ MAX_NEWTON_STEPS = 30
 CLOSURE_TOLERANCE = 1e-13
 """Largest motion (rad, scene diagonals) of the last Newton step: the closures are then satisfied to
 rounding."""
+ROUNDED_MOTION = 16.0
+"""Largest motion of Newton steps that are rounding of the positions, over that."""
 
 
 def onto_closures(system: System, t: float, state: FloatArray) -> FloatArray:
@@ -369,8 +374,11 @@ def onto_closures(system: System, t: float, state: FloatArray) -> FloatArray:
         correction = terms.correction()
         state = system.retract(state, -correction)
         size = system.position_norm(correction)
-        # Next to a singular configuration steps end at the rounding of the closures over sigma.
-        if size < CLOSURE_TOLERANCE or (closed and size >= before):
+        if size < CLOSURE_TOLERANCE:
+            return state
+        # Next to a singular configuration steps end at the rounding of the closures over sigma,
+        # after thousands of turns at that of the angles.
+        if size >= before and (closed or size < ROUNDED_MOTION * system.position_rounding(state)):
             return state
         before = size
     raise EvaluationError("no configuration that closes the loops was found near the one given")

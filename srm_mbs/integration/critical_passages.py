@@ -780,7 +780,8 @@ class CriticalPassages:
     def crossing(self, result: StepResult) -> float | None:
         """When (s) the step of ``result`` passes a singular configuration that has not been
         examined; None if it does not."""
-        if self._known or result.quiet:
+        # A step across the middle of a passage may be quiet: sigma is the same at both ends.
+        if self._known:
             return None
         lowest = int(np.argmin(result.sigmas))
         if lowest == 0 or not may_cross(result):

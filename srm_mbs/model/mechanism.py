@@ -395,10 +395,10 @@ class MechanismData(ResultOwner):
         """
         return replace(self, drives=without("drive", self.drives, name))
 
-    def moved(self, q: Any, v: Any) -> Self:
+    def moved(self, q: Any, v: Any, names: tuple[str, str] = STATE_ARGUMENTS) -> Self:
         """The same mechanism at another state, q (nq,) and v (nv,), of its motion: unlike with
-        :meth:`with_state`, drives continue their motion."""
-        changed = self._at(q, v, STATE_ARGUMENTS)
+        :meth:`with_state`, drives continue their motion.  Messages call the state ``names``."""
+        changed = self._at(q, v, names)
         return changed.with_drive_curves(self.drive_curves) if self.drives else changed
 
     def with_state(self, q0: Any, v0: Any) -> Self:

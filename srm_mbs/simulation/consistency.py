@@ -1,8 +1,10 @@
-"""Consistency of states with closures and drives: the check of starts, and the ends of runs.
+"""Consistency of states with closures and drives: the starts of runs, and their ends.
 
-The correction at the end of a step closes the loops up to the square of what it corrects, so the
-end of a run with a loose tolerance may be farther from the closures than a start is allowed to be.
-:func:`closed_end` moves it onto them, so that another run can start there.
+The correction at the end of a step closes the loops up to the square of what it corrects, and dense
+output lies within the tolerance of the closures, so states of a run may be farther from them than
+:data:`CONSISTENT`.  A run may start at such states of another one all the same:
+:func:`closed_start` moves a start onto the closures if its tolerance allows that,
+:func:`closed_end` the end of a run, from where one with any tolerance may go on.
 """
 
 from __future__ import annotations
@@ -17,15 +19,27 @@ from srm_mbs.dynamics.constraints.rheonomic import constraint_errors
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.scaling import Units, constraint_units
+from srm_mbs.dynamics.system import System, onto_closures
 from srm_mbs.errors import EvaluationError, InputError
 from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import closure_errors, largest_errors
+from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.integration.methods.branch_nodes import onto_closed_branch
+from srm_mbs.integration.methods.near_singular import WATCHED_SIGMA
 from srm_mbs.model.mechanism import per_start
 from srm_mbs.model.validation import START_ARGUMENTS
 
 CONSISTENT = 1e-8
-"""Largest closure error of an accepted start, in row units, and of its rates in those per time."""
+"""Closure error of a start, in row units, and of its rates in those per time, up to which it stays
+as it is."""
+LARGEST_MOVE = 10.0
+"""Largest motion of a start onto the closures, over the tolerance of the run: that of dense output
+with loose tolerances."""
+CLOSED = 1e-12
+"""Closure error, in row units, up to which a moved start is on the closures."""
+OPEN_DISTANCE = 0.05
+"""Motion of a start onto the closures, over sigma, above which it may belong to another branch: in
+narrow layers Newton's method led to that from 0.09 on."""
 MAY_VIOLATE = 0.1
 """Part of CONSISTENT in the units of the start of a run, from which it may be more in those of its
 end."""
@@ -93,6 +107,44 @@ def _accepted_times(mechanism: Mechanism) -> set[float]:
     return set()
 
 
+class Motion(NamedTuple):
+    """The motion of a start onto the closures.
+
+    Attributes
+    ----------
+    size
+        Norm, over the tolerance of the run.
+    sigma
+        sigma at the start.
+    is_open
+        Whether the start may belong to another branch than that to which the motion leads.
+    """
+
+    size: float
+    sigma: float
+    is_open: bool
+
+    @classmethod
+    def of(
+        cls, system: System, t: float, state: FloatArray, closed: FloatArray, norm: ErrorNorm
+    ) -> Motion:
+        """That of ``state`` (nx,) at ``t`` (s) to ``closed`` (nx,)."""
+        move = system.difference(state, closed)
+        sigma = system.evaluate(t, state).sigma
+        is_open = system.position_norm(move) > OPEN_DISTANCE * sigma
+        return cls(norm(move, norm.weights(system.state_scale(state))), sigma, is_open)
+
+    @property
+    def is_near_singular(self) -> bool:
+        """Whether that is so because a singular configuration is near."""
+        return self.is_open and self.sigma < WATCHED_SIGMA
+
+    @property
+    def size_text(self) -> str:
+        """The size, for messages."""
+        return f"{self.size:.2g} times the tolerance of the run (at most {LARGEST_MOVE:g})"
+
+
 def check_consistent(
     mechanism: Mechanism,
     t: float = 0.0,
@@ -109,19 +161,102 @@ def check_consistent(
     InputError
         Naming the row that is violated most.
     """
+    found = _violated(mechanism, t, backend, system)
+    if found is not None:
+        raise _refusal(mechanism, t, found, names)
+
+
+def closed_start(
+    mechanism: Mechanism,
+    t: float,
+    norm: ErrorNorm,
+    backend: str = "python",
+    system: OpenSystem | ClosedSystem | None = None,
+    names: tuple[str, str] = START_ARGUMENTS,
+) -> FloatArray:
+    """The state (nq + nv,) on the closures and drives in which a run of ``mechanism`` starts.
+
+    It is the initial state itself (``mechanism.start_state``) up to :data:`CONSISTENT`.  Beyond, it
+    is that moved along the normals, velocities by the M-orthogonal projection, if the motion is at
+    most :data:`LARGEST_MOVE` of the tolerance in ``norm``, that of the run.
+
+    Parameters
+    ----------
+    mechanism, t, backend, system, names
+        As for :func:`check_consistent`.
+
+    Raises
+    ------
+    InputError
+        For another start, naming the row that is violated most, and for one so close to a singular
+        configuration that the motion might lead to another branch.
+    """
+    found = _violated(mechanism, t, backend, system)
+    state = mechanism.start_state
+    if found is None:
+        return state
+    also, near_singular = "", False
+    with suppress(EvaluationError):
+        closures = make_system(mechanism)  # the controller is not called
+        closed = onto_closed_branch(closures, t, state)
+        # Nodes of a branch lead straight on, also where branches almost cross.
+        if closures.constraint_residual(t, closed) > CLOSED:
+            closed = onto_closures(closures, t, state)
+        motion = Motion.of(closures, t, state, closed, norm)
+        near_singular = motion.is_near_singular
+        if near_singular:
+            also = (
+                ", which leaves its branch open next to a singular configuration "
+                f"(sigma = {motion.sigma:.0e})"
+            )
+        elif motion.size > LARGEST_MOVE:
+            also = f"; the way onto them is {motion.size_text}"
+        elif not motion.is_open:
+            there = mechanism.moved(*closures.split(closed))
+            if _violated(there, t, backend) is None:
+                return closed
+    raise _refusal(mechanism, t, found, names, also, near_singular)
+
+
+def _violated(
+    mechanism: Mechanism, t: float, backend: str, system: OpenSystem | ClosedSystem | None = None
+) -> Violation | None:
+    """:func:`largest_violation` of the initial state, which is remembered to have none."""
     accepted = _accepted_times(mechanism)
     if t in accepted:
-        return
+        return None
     found = largest_violation(mechanism, t, mechanism.q0, mechanism.v0, backend, system)
-    if found is not None:
-        rows = mechanism.structure.row_names
-        kind = "drives" if found.row >= len(rows) - len(mechanism.drives) else "closures"
-        raise InputError(
-            f"the initial state violates the {kind}: row {rows[found.row]} by {found.value:.1e}",
-            element=names[found.rate],
-            remedy="Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v",
+    if found is None:
+        accepted.add(t)
+    return found
+
+
+def _refusal(
+    mechanism: Mechanism,
+    t: float,
+    found: Violation,
+    names: tuple[str, str],
+    also: str = "",
+    near_singular: bool = False,
+) -> InputError:
+    """The error about the violation ``found`` of a start at ``t`` (s); ``also`` says more of it."""
+    rows = mechanism.structure.row_names
+    kind = "drives" if found.row >= len(rows) - len(mechanism.drives) else "closures"
+    q, v = names
+    at = f", {t!r}" if t else ""
+    projected = f"srm.Simulator(mechanism).reset({q}, {v}{at}, project=True)"
+    remedy = "Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v"
+    if near_singular:
+        remedy = (
+            f"Start at another time of the motion, or on the branch of {v}: {projected} returns it"
         )
-    accepted.add(t)
+    elif mechanism.drives and t:  # where drives lead to by then, assembly does not know
+        remedy = f"Use {projected}, which returns a consistent q and v"
+    return InputError(
+        f"the initial state violates the {kind}: row {rows[found.row]} by {found.value:.1e}{also}",
+        element=names[found.rate],
+        remedy=remedy,
+    )
 
 
 def closed_end(
@@ -148,6 +283,6 @@ def closed_end(
         if violated(None, MAY_VIOLATE * CONSISTENT) and violated(
             mechanism.with_state(q, v).structure.units, CONSISTENT
         ):
-            # Functions of the user are not called again.
+            # The controller is not called again.
             return onto_closed_branch(make_system(mechanism), t, state)
     return state

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.dae import JACOBIAN_REMEDY, TIME_DERIVATIVE_REMEDY, DaeSystem
+from srm_mbs.dynamics.system import onto_closures
 from srm_mbs.errors import (
     CallbackError,
     ControllerError,
@@ -28,6 +30,7 @@ from srm_mbs.integration.methods.psrm import is_split
 from srm_mbs.integration.methods.thesis.dae_stability import instability
 from srm_mbs.integration.methods.thesis.sweep import SweepNode, carried_multipliers, sweep_nodes
 from srm_mbs.model.dae import SemiExplicitDAE
+from srm_mbs.simulation.consistency import LARGEST_MOVE, Motion
 from srm_mbs.simulation.dae_result import DaeResult
 from srm_mbs.simulation.monitoring import log_end, log_start
 from srm_mbs.simulation.options import (
@@ -51,7 +54,9 @@ from srm_mbs.simulation.runner import (
 Result = TypeVar("Result", bound=DaeResult)
 
 CONSISTENT = 1e-8
-"""Largest constraint error of an accepted start, as a relative error of x0."""
+"""Constraint error of a start, as a relative error of x0, up to which it stays as it is."""
+LISTED_STATES = 8
+"""States that a message lists at most."""
 DECAY_REMEDY = "If it is the states that are small, give an atol of rtol times their size there."
 """What to do where states have become so small that they seem next to a singular point."""
 PACE_REMEDY = "A larger rtol, or a right-hand side that changes less abruptly, allows longer ones."
@@ -100,14 +105,29 @@ def _absolute_tolerance(atol: Any, rtol: float, nx: int) -> FloatArray:
     return np.broadcast_to(array, (nx,)).copy()
 
 
-def _check_start(system: DaeSystem, method: Method, t0: float, x0: FloatArray) -> None:
+def _closed_start(system: DaeSystem, t0: float, x0: FloatArray, norm: ErrorNorm) -> FloatArray:
+    """``x0`` (nx,) on the constraints, as :func:`~srm_mbs.simulation.consistency.closed_start`."""
     gap = system.constraint_residual(t0, x0)
-    if not gap <= CONSISTENT:
-        raise InputError(
-            f"x0 violates g(t0, x0) = 0 by {gap:.1e} (relative error of x)",
-            element="x0",
-            remedy="Move x0 onto the constraints",
-        )
+    if gap <= CONSISTENT:
+        return x0
+    also, remedy = "", "Move x0 onto the constraints"
+    with suppress(EvaluationError):
+        closed = onto_closures(system, t0, x0)
+        motion = Motion.of(system, t0, x0, closed, norm)
+        if motion.size > LARGEST_MOVE:
+            also = f"; the way to it is {motion.size_text}"
+            if len(closed) <= LISTED_STATES and not motion.is_near_singular:
+                remedy += f": {closed.tolist()} is on them"
+        elif not motion.is_open:
+            return closed
+    raise InputError(
+        f"x0 violates g(t0, x0) = 0 by {gap:.1e} (relative error of x){also}",
+        element="x0",
+        remedy=remedy,
+    )
+
+
+def _check_prediction(system: DaeSystem, method: Method) -> None:
     if not system.predicts and getattr(method, "prediction", "") == "exact":
         raise InputError(
             "g depends on t, and its derivative is not given",
@@ -155,7 +175,11 @@ def run_dae(
     norm = ErrorNorm(tolerance, options.rtol, options.negligible)
     T = getattr(method, "T", "identity")
     system = DaeSystem(problem, t0, state, options.t_end, norm.one, T)
-    _check_start(system, method, t0, state)
+    closed = _closed_start(system, t0, state, norm)
+    if closed is not state:
+        state = closed
+        system = DaeSystem(problem, t0, state, options.t_end, norm.one, T)
+    _check_prediction(system, method)
     log_start("DAE", options, norm, "python")
     watch = None
     if options.events is not None:

@@ -85,7 +85,8 @@ from srm_mbs.model.forces import LimitSpring
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import per_model, per_tree
 from srm_mbs.model.numbers import finite_array
-from srm_mbs.simulation.consistency import check_consistent
+from srm_mbs.model.validation import START_ARGUMENTS
+from srm_mbs.simulation.consistency import closed_start
 from srm_mbs.simulation.failure_causes import (
     HeldForceWatch,
     failure_cause,
@@ -460,8 +461,12 @@ def initial_state(
     """
     known = (q0 is None or q0 is mechanism.q0) and (v0 is None or v0 is mechanism.v0)
     if not known:
-        start_at = mechanism.with_state if t0 == 0.0 else mechanism.moved
-        mechanism = start_at(mechanism.q0 if q0 is None else q0, mechanism.v0 if v0 is None else v0)
+        q0 = mechanism.q0 if q0 is None else q0
+        v0 = mechanism.v0 if v0 is None else v0
+        if t0 == 0.0:
+            mechanism = mechanism.with_state(q0, v0)
+        else:
+            mechanism = mechanism.moved(q0, v0, START_ARGUMENTS)
     return mechanism, mechanism.start_state
 
 
@@ -507,7 +512,10 @@ def assemble_problem(
         norm = error_norm(mechanism, options)
         mechanism.check_covers(t_end)
     if mechanism.constrained:
-        check_consistent(mechanism, t0, by, system)
+        closed = closed_start(mechanism, t0, norm, by, system)
+        if closed is not mechanism.start_state:
+            q0, v0 = system.split(closed)
+            return assemble_problem(mechanism, options._replace(q0=q0, v0=v0), before)
     watch: EventWatch | CompiledEventWatch | None = None
     if options.events is not None:
         nq, nv = system.nq, system.nv

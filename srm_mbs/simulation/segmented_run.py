@@ -36,12 +36,13 @@ from srm_mbs.model.drives import positions
 from srm_mbs.model.laws import Curve
 from srm_mbs.model.numbers import positive_number
 from srm_mbs.model.validation import STATE_ARGUMENTS
-from srm_mbs.simulation.consistency import check_consistent
+from srm_mbs.simulation.consistency import check_consistent, closed_start
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.result import SimulationResult
 from srm_mbs.simulation.runner import (
     Segment,
     checked_options,
+    error_norm,
     finished,
     initial_state,
     raise_at_first_call,
@@ -430,7 +431,9 @@ def _at_start(
     contacts = [event for event in events if event.may_touch and event.left > 1]
     if contacts:
         if started.constrained:
-            check_consistent(started, t0)
+            closed = closed_start(started, t0, error_norm(started, options))
+            if closed is not x:
+                started, x = initial_state(mechanism, t0, closed[:nq], closed[nq:])
         found = _act_at_once(
             contacts, started, t0, x[:nq], x[nq:], options.controller, span, occurred
         )

@@ -33,7 +33,7 @@ from srm_mbs.integration.methods.branch_nodes import onto_closed_branch
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.model.numbers import positive_number, real_array
 from srm_mbs.model.validation import STATE_ARGUMENTS
-from srm_mbs.simulation.consistency import check_consistent
+from srm_mbs.simulation.consistency import closed_start
 from srm_mbs.simulation.failure_causes import HeldForceWatch, failure_cause
 from srm_mbs.simulation.incremental_run import IncrementalRun, KernelRun, ReferenceRun
 from srm_mbs.simulation.options import (
@@ -131,9 +131,13 @@ class Simulator:
         options = checked_accuracy(mechanism, RunOptions(math.inf, **given), 0.0, math.inf)
         options = above_rounding(mechanism, options)
         check_embedded(options.method.scheme, step)
-        check_consistent(mechanism)
-        self._mechanism, self._options = mechanism, options
         self._norm = error_norm(mechanism, options)
+        state = closed_start(mechanism, 0.0, self._norm)
+        if state is not mechanism.start_state:
+            nq = mechanism.model.nq
+            mechanism = mechanism.with_state(state[:nq], state[nq:])
+            self._norm = error_norm(mechanism, options)
+        self._mechanism, self._options = mechanism, options
         by = chosen_backend(backend, options.method, options.placement, options.singular_times)
         self._backend, _ = code_of_run(by, backend, mechanism)
         metered = self._backend == "kernel" and backend == "auto" and code_is_compiled()
@@ -383,9 +387,9 @@ class Simulator:
         mechanism = self._mechanism
         t = finite(t, "t")
         if q is None and v is None and not project:
-            if mechanism.drives:
-                check_consistent(mechanism, t, names=STATE_ARGUMENTS)
             state = mechanism.start_state
+            if mechanism.drives:
+                state = closed_start(mechanism, t, self._norm, names=STATE_ARGUMENTS)
         else:
             q = mechanism.q0 if q is None else q
             v = mechanism.v0 if v is None else v
@@ -404,11 +408,11 @@ class Simulator:
         Parameters
         ----------
         q : (nq,), v : (nv,)
-            By default as they are.  They must satisfy the closures to 1e-8, as in
-            :func:`srm_mbs.simulate`.
+            By default as they are.  They must satisfy the closures as the start of
+            :func:`srm_mbs.simulate` does: up to ten times the tolerance, they are moved onto them.
         project
-            Move them onto the closures instead: q along the normals, v to the M-orthogonal
-            projection v - P v, as after an inelastic impact.
+            Move them onto the closures however far they are: q along the normals, v to the
+            M-orthogonal projection v - P v, as after an inelastic impact.
 
         Raises
         ------
@@ -432,8 +436,7 @@ class Simulator:
                 ) from error
             q, v = state[: self._nq], state[self._nq :]
         moved = self._mechanism.moved(q, v)
-        check_consistent(moved, t, names=STATE_ARGUMENTS)
-        return moved.start_state
+        return closed_start(moved, t, self._norm, names=STATE_ARGUMENTS)
 
     @_alone
     def clone(self) -> Simulator:

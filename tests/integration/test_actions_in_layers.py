@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import srm_mbs as srm
 from tests.integration.test_almost_singular import OFFSETS, Reference, slider_crank
@@ -58,6 +59,29 @@ def test_a_start_in_a_layer_follows_its_curve(
     d: float, rtol: float, place: float, backend: str
 ) -> None:
     check_start(d, rtol, place, backend)
+
+
+@on_both
+@pytest.mark.parametrize(
+    ("d", "rtol", "before"),
+    [
+        (1e-8, 1e-3, 3.51e-2),
+        (-1e-8, 1e-3, 3.51e-2),
+        (1e-10, 1e-4, 2.65e-2),
+        (-1e-10, 1e-4, 2.77e-2),
+    ],
+)
+def test_a_first_step_across_the_middle_of_a_layer_sees_it(
+    d: float, rtol: float, before: float, backend: str
+) -> None:
+    # sigma is the same at both ends of a step of twice the time ``before`` the corner (s).
+    mechanism, reference = slider_crank(d), Reference(d)
+    t = reference.time(angle_at(reference, d, 0.0)) - before
+    angle = brentq(lambda a: reference.time(a) - t, 0.3 * reference.sign, 1.57 * reference.sign)
+    q, v = state_at(reference, angle)
+    solution = srm.simulate(mechanism, T_END, t0=t, q0=q, v0=v, rtol=rtol, backend=backend, **EXACT)
+    assert solution.success, solution.message
+    assert reference.error(solution) < 3.0 * rtol
 
 
 @pytest.mark.stress

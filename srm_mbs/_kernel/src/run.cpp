@@ -351,7 +351,8 @@ bool Run::misses_jump(const Proposal& proposal, const StepResult& r) {
 
 // When the step passes a singular configuration that has not been examined.
 std::optional<double> Run::crossing(const StepResult& r) const {
-    if (known_ || r.quiet) return {};
+    // A step across the middle of a passage may be quiet: sigma is the same at both ends.
+    if (known_) return {};
     const auto [low, high] = std::minmax_element(r.sigmas.begin(), r.sigmas.end());
     if (low == r.sigmas.begin() || !(2.0 * *low < *high)) return {};
     std::vector<double> abscissae(made_by_->scheme.c);

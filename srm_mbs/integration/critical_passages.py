@@ -58,6 +58,8 @@ ROUNDED_RESIDUAL = 1e-13
 DISTURBING = 1e-3
 """Residual that counts as zero, over rtol, up to which steps pass as if it were, unless they are
 to end beside the passage."""
+CURVE_TRIES = 12
+"""Halvings of a step that leads to the other curve."""
 WIDE = 0.5 * SEARCH**2
 """Residual (row units) from which the layer, of sqrt(2 |delta|) where H is 1, is as wide as that:
 steps resolve it."""
@@ -109,10 +111,10 @@ followed along the curve."""
 FIRST_PART = 0.1
 """First step after a motion that starts in a layer, over the time in which it leaves that."""
 SHORTENED = 0.5
-"""Length of a panel beyond the layer, over that of one in which the motion slows down too much."""
+"""Length of a panel outside of the layer, over that of one in which the energy changes too much."""
 LEAST_ENERGY = 0.75
-"""Kinetic energy on a panel beyond the layer, over that at its start, from which polynomials on it
-resolve the time: the rate of that grows without bound where the motion turns back."""
+"""Least kinetic energy on a panel outside of the layer, over the largest, from which polynomials on
+it resolve the time: the rate of that grows without bound where the motion turns back."""
 SMALLEST_REST = 1e-9
 """Rest of a passage, over its whole, that is none."""
 
@@ -365,17 +367,21 @@ class PassageAlongCurve:
     def _panels(self, at: float, edge: float) -> float:
         """Go on from ``at`` to the ``edge``, of xi times the heading; where that led.
 
-        Beyond the layer that may be less, where the motion turns back soon.
+        Beyond the layer that may be less, where the motion turns back soon.  Where the energy
+        changes much, panels are shorter.
         """
         target = edge
         while at < edge and self._clock < self.end:
             try:
                 at, target = self._panel(at, target), edge
             except ValueError:
+                beyond, before = at >= LAYER, target <= -LAYER
                 target = at + SHORTENED * (target - at)
-                if self.exact or at < LAYER:
+                if self.exact or not (beyond or before):
                     raise
                 if target - at < SHORTEST_PANEL:
+                    if before:
+                        raise
                     break
         return at
 
@@ -534,16 +540,18 @@ class PassageAlongCurve:
         weights, own = np.vstack([integrals, w]), np.concatenate([[0.0], x, [1.0]])
         # Of the evaluation made last.
         mass = self.critical.geometry.mass()
-        beyond = not (self._driven or self.exact or a < LAYER)
-        least = LEAST_ENERGY * self._energy if beyond else 0.0
+        least, most = 0.0, np.inf
+        if not (self._driven or self.exact):
+            least = LEAST_ENERGY * self._energy if a >= LAYER else 0.0
+            most = self._energy / LEAST_ENERGY if b <= -LAYER else np.inf
         while True:
             xi = self._heading * (a + (b - a) * x)
             slope = self._width * np.cosh(xi) * self._heading * (b - a)
             betas = self._width * np.sinh(xi)
             start = self._width * np.sinh(self._heading * a)
             energy = self._energy + self._found[-1][0].power * (betas - start)
-            if not (energy > least).all():
-                raise ValueError("the energy does not suffice to pass")
+            if not ((energy > least) & (energy < most)).all():
+                raise ValueError("the energy changes too much")
             predicted = [
                 self._predicted(*one, mass) for one in zip(betas.tolist(), energy.tolist())
             ]
@@ -558,8 +566,8 @@ class PassageAlongCurve:
         nodes = [self._evaluated(*one) for one in zip(places, betas.tolist(), rates, t.tolist())]
         for _ in range(SWEEPS):
             energies = self._energy + weights @ (slope * [node.power for node in nodes])
-            if not (energies > least).all():
-                raise ValueError("the energy does not suffice to pass")
+            if not ((energies > least) & (energies < most)).all():
+                raise ValueError("the energy changes too much")
             speeds = [self._speed(*one) for one in zip(nodes, energies.tolist())]
             if not (np.array(speeds) * slope > 0.0).all():
                 raise ValueError("the drives lead where the mechanism cannot follow")
@@ -732,6 +740,23 @@ def layer_motion(
     return PlaceOnCurve(critical, False, curve, begin, curve.beta, energy)
 
 
+def _changes_curve(critical: CriticalConfiguration, begin: FloatArray, end: FloatArray) -> bool:
+    """Whether the places ``begin`` and ``end`` are on the two curves beside a ``critical``
+    configuration; not, if its hyperbolas do not tell."""
+    sides = []
+    for place in (begin, end):
+        try:
+            curve = CurveThroughSaddle(critical, place, False)
+        except (ValueError, np.linalg.LinAlgError):
+            return False
+        on, away = curve.hyperbola(curve.beta)[0], critical.geometry.difference(critical.q, place)
+        kept = on - curve.beta * curve.along
+        if not np.linalg.norm(away - on) < LARGEST_DEVIATION * np.linalg.norm(kept):
+            return False
+        sides.append(kept)
+    return float(sides[0] @ sides[1]) < 0.0
+
+
 class CriticalPassages:
     """Examines the singular configurations that steps would pass; used by the drivers.
 
@@ -746,6 +771,8 @@ class CriticalPassages:
     ----------
     examined
         The passages whose residual is not zero to rounding, in order of time.
+    curve_limit
+        Longest step (s) after one that led to another curve.
     """
 
     def __init__(
@@ -757,6 +784,10 @@ class CriticalPassages:
         self._sigma = self._examine_below = np.inf
         self._rest: PlaceOnCurve | None = None
         self._found: list[CriticalConfiguration] = []
+        self._avoided: CriticalConfiguration | None = None
+        self._unresolved: ExaminedPassage | None = None
+        self._tries = 0
+        self.curve_limit = np.inf
         self.examined: list[ExaminedPassage] = []
 
     @cached_property
@@ -780,6 +811,7 @@ class CriticalPassages:
     def crossing(self, result: StepResult) -> float | None:
         """When (s) the step of ``result`` passes a singular configuration that has not been
         examined; None if it does not."""
+        self._unresolved = None
         # A step across the middle of a passage may be quiet: sigma is the same at both ends.
         if self._known:
             return None
@@ -798,9 +830,55 @@ class CriticalPassages:
             return None
         return None if self._quiet and not self._one_freedom else zero
 
+    def changes_curve(self, state: FloatArray, result: StepResult) -> bool:
+        """Whether the step of ``result`` from ``state`` (nx,) leads to the other one of the curves
+        beside a critical configuration that the closures avoid; the next step is shorter then.
+
+        That is the one that steps were to pass, or one to which a step turns back that started as
+        near to it as it comes again.
+        """
+        if not self._one_freedom or result.quiet or not may_cross(result):
+            return False
+        system = self._system
+        analysis = system.singularities
+        geometry = analysis.geometry(analysis.q0, result.t)
+        begin, end = (
+            geometry.at(analysis.split(x)[0], t)
+            for x, t in ((state, result.t), (result.state, result.t + result.h))
+        )
+        if int(np.argmin(result.sigmas)) == 0:
+            before, after = (
+                geometry.rates(rate[: system.nv])[: system.nv]
+                for rate in (result.rates[0], result.end_rate)
+            )
+            if not float(before @ after) < 0.0:
+                return False
+            critical = critical_configuration(
+                geometry, analysis.rank, begin, SEARCH, self._found, ROUNDED_RESIDUAL
+            )
+            if critical is not None and not self._avoids(critical):
+                critical = None
+            self._avoided = critical
+        if self._avoided is None or not _changes_curve(self._avoided, begin, end):
+            return False
+        if self._tries == CURVE_TRIES:
+            self._unresolved = ExaminedPassage(
+                result.t, self._avoided.residual, avoided=True, resolved=False
+            )
+            return False
+        self.curve_limit = 0.5 * result.h
+        self._tries += 1
+        return True
+
+    def _avoids(self, critical: CriticalConfiguration) -> bool:
+        return abs(critical.residual) > max(self._tolerance, ROUNDED_RESIDUAL)
+
     def accepted(self, result: StepResult) -> None:
         """A step was accepted: where sigma rises, the next passage is another one."""
         self._quiet, self._sigma = result.quiet, float(result.sigmas[-1])
+        self.curve_limit, self._tries = np.inf, 0
+        if self._unresolved is not None:
+            self.examined.append(self._unresolved)
         if result.sigmas[-1] > result.sigmas[0]:
             self._known, self._examine_below = False, np.inf
 
@@ -837,6 +915,7 @@ class CriticalPassages:
         critical = critical_configuration(
             geometry, analysis.rank, place, SEARCH, self._found, ROUNDED_RESIDUAL
         )
+        self._avoided = None
         if critical is None:
             return []
         begin = geometry.at(analysis.split(state)[0], t)
@@ -852,7 +931,7 @@ class CriticalPassages:
             if self._one_freedom and not geometry.drives and critical.geometry is geometry:
                 self._found.append(critical)
             return []
-        avoided = abs(residual) > self._tolerance
+        avoided, steps_pass = abs(residual) > self._tolerance, False
         steps: list[tuple[StepResult, float]] = []
         disturbs = abs(residual) > DISTURBING * self._norm.rtol
         if avoided or disturbs or end < zero + ahead:
@@ -864,9 +943,15 @@ class CriticalPassages:
             except (ValueError, EvaluationError, np.linalg.LinAlgError):
                 # Steps pass it as well as they can, and the message says so.  A motion that has
                 # still to turn back is examined again.
-                self._known = self._known and not (self._one_freedom and expected)
+                steps_pass = self._one_freedom
+        self._known = self._known and not steps_pass
+        found = ExaminedPassage(zero, residual, avoided, bool(steps))
         if self._known or steps:
-            self.examined.append(ExaminedPassage(zero, residual, avoided, bool(steps)))
+            self.examined.append(found)
+        if steps_pass and not expected:
+            self._unresolved = found
+        if steps_pass and avoided:
+            self._avoided = critical
         return steps
 
     def steps_on(self, t: float, state: FloatArray, end: float) -> list[tuple[StepResult, float]]:

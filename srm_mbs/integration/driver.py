@@ -438,6 +438,8 @@ def integrate(
             if system.rescale(t, x):
                 memory = restarted()
             limit = min(max_step, system.step_limit(x), jump.limit, rest_limit)
+            if passages is not None:
+                limit = min(limit, passages.curve_limit)
             proposal = control.propose(t, limit, memory)
             if proposal.singular_arrival and breakpoints is not None:
                 memory = breakpoints.singular_arrival(t, x, memory)
@@ -460,6 +462,13 @@ def integrate(
                 unevaluated = RunFailure(StopReason.NOT_EVALUATED, str(error))
             if result is not None and pass_critical(
                 None if passages is None else passages.crossing(result), False
+            ):
+                continue
+            if (
+                result is not None
+                and passages is not None
+                and control.adaptive
+                and passages.changes_curve(x, result)
             ):
                 continue
             if result is not None and jump.misses(proposal, memory, result, control.adaptive):

@@ -48,6 +48,7 @@ from srm_mbs.integration.control.step_size import (
     initial_step,
 )
 from srm_mbs.integration.critical_passages import (
+    ROUNDED_RESIDUAL,
     CriticalPassages,
     examined_passages,
     step_from_layer,
@@ -432,19 +433,21 @@ def absolute_tolerance(mechanism: Mechanism, atol: Any, rtol: float) -> FloatArr
 
 
 @per_model
-def _usual_norms(mechanism: Mechanism) -> dict[tuple[float, float, Units], ErrorNorm]:
-    """Error norms without an absolute tolerance of the user, by rtol, ``negligible`` and units."""
+def _usual_norms(mechanism: Mechanism) -> dict[tuple[float, float, float, Units], ErrorNorm]:
+    """Error norms without an absolute tolerance of the user, by what they are made of."""
     return {}
 
 
 def error_norm(mechanism: Mechanism, options: RunOptions) -> ErrorNorm:
     """The error norm with the tolerances of checked ``options``."""
     known = _usual_norms(mechanism)
-    key = options.rtol, options.negligible, mechanism.structure.units
+    singular = max(options.singular_tolerance, ROUNDED_RESIDUAL)
+    key = options.rtol, options.negligible, singular, mechanism.structure.units
     if options.atol is None and key in known:
         return known[key]
     atol = absolute_tolerance(mechanism, options.atol, options.rtol)
-    norm = ErrorNorm(atol, options.rtol, options.negligible, mechanism.structure.units.state)
+    unit = mechanism.structure.units.state
+    norm = ErrorNorm(atol, options.rtol, options.negligible, unit, singular)
     if options.atol is None:
         if len(known) >= KEPT_NORMS:
             known.clear()

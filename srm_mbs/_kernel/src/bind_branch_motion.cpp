@@ -15,10 +15,10 @@ struct PyBranchNodes {
     System& system;
     BranchNodes nodes;
 
-    PyBranchNodes(nb::object owner_, const Constants& constants)
+    PyBranchNodes(nb::object owner_, const Constants& constants, double singular)
         : owner(std::move(owner_)),
           system(system_in(owner)),
-          nodes(system, constants) {}
+          nodes(system, constants, singular) {}
 
     // (state, rate, multiplier, moved, away) of a stage (nx,) along the direction `away` (nv,), or
     // None.
@@ -102,7 +102,7 @@ void bind_branch_motion(nb::module_& m) {
         .def_ro("sigma", &BranchPoint::sigma);
     nb::class_<PyBranchNodes>(
         m, "BranchNodes", nb::type_slots(collected<PyBranchNodes, &PyBranchNodes::owner>()))
-        .def(nb::init<nb::object, const Constants&>(), nb::keep_alive<1, 3>())
+        .def(nb::init<nb::object, const Constants&, double>(), nb::keep_alive<1, 3>())
         .def("solve", &PyBranchNodes::solve, nb::arg("t"), nb::arg("state"), nb::arg("away"));
     nb::class_<PyBranchMotion>(
         m, "BranchMotion", nb::type_slots(collected<PyBranchMotion, &PyBranchMotion::owner>()))

@@ -23,9 +23,10 @@ constexpr std::array<double, 8> slope = {-0.8,          0.8,          0.2,      
 
 }  // namespace
 
-BranchNodes::BranchNodes(System& system, const Constants& constants)
+BranchNodes::BranchNodes(System& system, const Constants& constants, double singular)
     : system_(system),
       constants_(constants),
+      singular_(singular),
       nv_(system.nv),
       nx_(system.nq + system.nv),
       nodes_(count * nx_),
@@ -135,6 +136,15 @@ bool BranchNodes::follow(int k, double t, const double* from,
     return false;
 }
 
+// Whether the closures at the state between the nodes, evaluated last, are open by more than a branch
+// may be: they avoid the singular configuration, and the nodes are on two curves.  sigma |E g| is
+// the residual of the critical combination of rows, and not that of others.
+bool BranchNodes::avoided() {
+    if (!(system_.closure_residual() > singular_)) return false;
+    system_.correction(change_.data());
+    return system_.sigma() * system_.position_norm(change_.data()) > singular_;
+}
+
 bool BranchNodes::solve(double t, const double* from, const std::vector<double>& direction) {
     // The state itself was evaluated last.
     system_.driven_residuals(residuals_);
@@ -150,6 +160,7 @@ bool BranchNodes::solve(double t, const double* from, const std::vector<double>&
     for (int i = 0; i < 2 * nv_; ++i) step_[i] = -moved[i];
     system_.retract(from, step_.data(), state.data());
     system_.evaluate(t, state.data(), System::ZoneView{});
+    if (avoided()) return false;
     std::copy(state.end() - nv_, state.end(), rate.begin());
     double* const acceleration = rate.data() + nv_;
     system_.free_acceleration(acceleration);

@@ -13,7 +13,8 @@ namespace srm {
 // Results of solve() are those of StageOnBranch.
 class BranchNodes : public StageOnBranch {
 public:
-    BranchNodes(System& system, const Constants& constants);
+    // `singular`: residual (row units) of the state on the branch, up to which there is that branch.
+    BranchNodes(System& system, const Constants& constants, double singular);
 
     // A direction (nv,) of the branch that leads away from the singular configuration, as long as
     // nodes are apart, or its frame where branches touch; empty if the state (nx,) does not
@@ -28,11 +29,13 @@ public:
 private:
     static constexpr int each_side = 4, count = 2 * each_side;
 
+    bool avoided();
     bool follow(int k, double t, const double* state, const std::vector<double>& away);
     double sigma_at(double t, const double* state, const double* direction, double length);
 
     System& system_;
     const Constants& constants_;
+    const double singular_;
     const int nv_, nx_;
     // Of the nodes (count, nv): positions, motions onto the closures, rates off the branch,
     // multipliers.

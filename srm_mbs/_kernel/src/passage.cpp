@@ -56,7 +56,8 @@ public:
           critical_(motion.critical),
           n_(closures.n),
           rank_(static_cast<int>(critical_.rows.size())),
-          exact_(motion.exact) {
+          exact_(motion.exact),
+          largest_deviation_(constants.largest_deviation) {
         const CriticalConfiguration& critical = critical_;
         if (n_ - rank_ != 1) throw NoPassage{};
         strong_ = critical.u;
@@ -116,7 +117,19 @@ public:
         hyperbola(beta, on, slope);
         const double distance = norm(away.data(), n_);
         add(-1.0, on.data(), away.data(), n_);
-        if (!(norm(away.data(), n_) < constants.largest_deviation * distance)) throw NoPassage{};
+        if (!(norm(away.data(), n_) < largest_deviation_ * distance)) throw NoPassage{};
+    }
+
+    // The sign of the kept coordinate of a place; 0 if the hyperbola does not tell it.
+    int side_of(const Vector& x, double t) {
+        Vector away(n_);
+        closures_.difference(critical_.x, critical_.t, x, t, away.data());
+        const double at = dot(along.data(), away.data(), n_);
+        const int sign = dot(kept_.data(), away.data(), n_) > 0.0 ? 1 : -1;
+        const double kept = std::sqrt(level_ + ratio_ * at * at);
+        add(-at, along.data(), away.data(), n_);
+        add(-sign * kept, kept_.data(), away.data(), n_);
+        return norm(away.data(), n_) < largest_deviation_ * kept ? sign : 0;
     }
 
     // The point of the hyperbola at `at`, as a displacement from q*, and its derivative.
@@ -195,6 +208,7 @@ private:
     const CriticalConfiguration& critical_;
     const int n_, rank_;
     const bool exact_;
+    const double largest_deviation_;
     double delta_ = 0.0, level_ = 0.0, ratio_ = 1.0;
     Vector strong_, kept_, values_, rows_, matrix_;
 };
@@ -479,7 +493,8 @@ private:
     }
 
     // Goes on from `at` to the edge, of xi times the heading; returns where that led.  Beyond the
-    // layer that may be less, where the motion turns back soon.
+    // layer that may be less, where the motion turns back soon.  Where the energy changes much, panels
+    // are shorter.
     double panels(double at, double edge) {
         double target = edge;
         while (at < edge && clock_ < end_) {
@@ -487,9 +502,13 @@ private:
                 at = panel(at, target);
                 target = edge;
             } catch (const NoPassage&) {
+                const bool beyond = at >= constants_.layer, before = target <= -constants_.layer;
                 target = at + constants_.panel_shortened * (target - at);
-                if (motion_.exact || at < constants_.layer) throw;
-                if (target - at < constants_.shortest_panel) break;
+                if (motion_.exact || !(beyond || before)) throw;
+                if (target - at < constants_.shortest_panel) {
+                    if (before) throw;
+                    break;
+                }
             }
         }
         return at;
@@ -506,8 +525,11 @@ private:
         Vector own{0.0};
         own.insert(own.end(), x.begin(), x.end());
         own.push_back(1.0);
-        const bool beyond = !(driven_ || motion_.exact || a < constants_.layer);
-        const double least = beyond ? constants_.least_energy * energy_ : 0.0;
+        double least = 0.0, most = infinity;
+        if (!(driven_ || motion_.exact)) {
+            if (a >= constants_.layer) least = constants_.least_energy * energy_;
+            if (b <= -constants_.layer) most = energy_ / constants_.least_energy;
+        }
         const auto with_start = [](double first, const Vector& values) {
             Vector out{first};
             out.insert(out.end(), values.begin(), values.end());
@@ -517,7 +539,7 @@ private:
             for (int i = 0; i < count_; ++i) {
                 const double xi = heading_ * (a + (b - a) * x[i]), beta = width_ * std::sinh(xi);
                 const double energy = energy_ + power * (beta - start);
-                if (!(energy > least)) throw NoPassage{};
+                if (!(energy > least && energy < most)) throw NoPassage{};
                 double rate;
                 nodes[i] = predicted(beta, energy, rate);
                 slope[i] = width_ * std::cosh(xi) * heading_ * (b - a);
@@ -535,7 +557,7 @@ private:
             for (int i = 0; i < count_; ++i) works[i] = slope[i] * nodes[i].power;
             integrate(works, energy_, energies);
             for (double value : energies)
-                if (!(value > least)) throw NoPassage{};
+                if (!(value > least && value < most)) throw NoPassage{};
             for (int i = 0; i < count_; ++i) {
                 durations[i] = slope[i] / speed(nodes[i], energies[i]);
                 if (!(durations[i] > 0.0)) throw NoPassage{};
@@ -757,6 +779,18 @@ std::optional<MotionAlongCurve> motion_in_layer(System& system, double t,
         return {};
     } catch (const EvaluationError&) {
         return {};
+    }
+}
+
+bool changes_curve(UnitClosures& closures, const CriticalConfiguration& critical, double t,
+                   const std::vector<double>& state, double t_end,
+                   const std::vector<double>& end, const Constants& constants) {
+    const MotionAlongCurve motion{critical, closures.time_unit, false};
+    try {
+        SaddleCurve curve(closures, motion, state, t, constants);
+        return curve.side_of(state, t) * curve.side_of(end, t_end) < 0;
+    } catch (const NoPassage&) {
+        return false;
     }
 }
 

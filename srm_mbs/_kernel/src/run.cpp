@@ -212,6 +212,8 @@ void Run::resume(double t, const std::vector<double>& from, IntegratorState know
     state = from;
     prepared_.clear();
     passage_.reset();
+    curve_limit_ = infinity;
+    curve_tries_ = 0;
     memory = std::move(known);
     control->resume(known_control);
     const bool enters = interval_ > 0 && t == ends[interval_ - 1];
@@ -229,6 +231,7 @@ RunSnapshot Run::snapshot() const {
     out.known = known_;
     out.quiet = quiet_;
     out.examine_below = examine_below_;
+    out.avoided = avoided_;
     out.passage = passage_;
     return out;
 }
@@ -240,6 +243,7 @@ void Run::restore(const RunSnapshot& snapshot) {
     known_ = snapshot.known;
     quiet_ = snapshot.quiet;
     examine_below_ = snapshot.examine_below;
+    avoided_ = snapshot.avoided;
     passage_ = snapshot.passage;
 }
 
@@ -252,7 +256,8 @@ Stop Run::attempt(StepDecision& decision) {
         if (!restart_interval()) return Stop::breakpoint;
     }
     const double limit =
-        std::min({max_step_, system.step_limit(state.data()), jump_limit_, rest_limit_});
+        std::min({max_step_, system.step_limit(state.data()), jump_limit_, rest_limit_,
+                  curve_limit_});
     const Proposal proposal = control->propose(t_, limit, memory);
     if (proposal.arriving) return Stop::arrival;
     const double h = h_ = proposal.h;
@@ -270,6 +275,7 @@ Stop Run::attempt(StepDecision& decision) {
         t_ - watched_time_ < constants().standstill * (t_end() - t0_))
         return Stop::standstill;
     const StepResult* result = nullptr;
+    unresolved_.reset();
     system.begin_step(t_, state.data());
     try {
         const double theta =
@@ -282,6 +288,14 @@ Stop Run::attempt(StepDecision& decision) {
     if (result && examines_) {
         const std::optional<double> zero = crossing(*result);
         if (zero && examine(*zero, false)) return make_prepared();
+        if (changes_curve(*result)) {
+            if (curve_tries_ < constants().curve_tries) {
+                curve_limit_ = 0.5 * h;
+                ++curve_tries_;
+                return Stop::chunk;
+            }
+            unresolved_ = ExaminedPassage{t_, avoided_->residual, true, false};
+        }
     }
     if (result && misses_jump(proposal, *result)) return Stop::chunk;
     decision = control->decide(proposal, result);
@@ -300,12 +314,13 @@ Stop Run::attempt(StepDecision& decision) {
         examine_below_ = infinity;
     }
     if (leaves_closures_open(*result)) return Stop::closures;
+    if (unresolved_) examined.push_back(*unresolved_);
     if (result->in_zone)
         records.zones.push_back({records.count(), result->zone_threshold, *memory.history});
     record(*result, proposal.t_new, placement);
     const bool jumped = on_jump_;
-    jump_limit_ = rest_limit_ = infinity;
-    jump_tries_ = 0;
+    jump_limit_ = rest_limit_ = curve_limit_ = infinity;
+    jump_tries_ = curve_tries_ = 0;
     on_jump_ = false;
     inaccurate_ = jumped && t_ < interval_end() && !restart_after_break();
     return t_ < t_end() ? Stop::chunk : Stop::finished;
@@ -362,6 +377,31 @@ std::optional<double> Run::crossing(const StepResult& r) const {
     return r.t + (inside ? zero : abscissae[low - r.sigmas.begin()]) * r.h;
 }
 
+// Whether the step leads to the other one of the curves beside a critical configuration:
+// CriticalPassages.changes_curve in integration/critical_passages.py.
+bool Run::changes_curve(const StepResult& r) {
+    if (!one_freedom_ || r.quiet || !control->adaptive) return false;
+    const auto [low, high] = std::minmax_element(r.sigmas.begin(), r.sigmas.end());
+    if (!(2.0 * *low < *high)) return false;
+    UnitClosures closures(system, r.h);
+    if (low == r.sigmas.begin()) {
+        const double* before = memory.rate.data();
+        double turned = 0.0;
+        for (int i = 0; i < system.nv; ++i)
+            turned += before[i] * r.end_rate[i] / (system.unit(i) * system.unit(i));
+        if (!(turned < 0.0)) return false;
+        avoided_ = critical_of_passage(closures, t_, state.data(), before, t_, constants());
+        if (avoided_ && !avoids(*avoided_)) avoided_.reset();
+    }
+    return avoided_ && srm::changes_curve(closures, *avoided_, t_, state, r.t + r.h, r.state,
+                                          constants());
+}
+
+bool Run::avoids(const CriticalConfiguration& critical) const {
+    return std::abs(critical.residual) >
+           std::max(singular_tolerance_, constants().rounded_residual);
+}
+
 // Examines the passage at `zero`, which is expected or lies in a step, and prepares the steps along
 // the curve if ordinary steps are not to make it; whether there are any.
 bool Run::examine(double zero, bool expected) {
@@ -371,6 +411,7 @@ bool Run::examine(double zero, bool expected) {
     const auto critical = critical_of_passage(closures, t_, state.data(), memory.rate.data(), zero,
                                               constants());
     known_ = critical && critical->passed;
+    avoided_.reset();
     if (!critical) return false;
     const double residual = std::abs(critical->residual);
     if (!(residual > constants().rounded_residual)) return false;
@@ -385,13 +426,17 @@ bool Run::examine(double zero, bool expected) {
     const bool avoided = residual > singular_tolerance_;
     // Steps may pass a residual that is far below the tolerance, but not end beside it.
     const bool disturbs = residual > constants().disturbing * rtol;
+    bool steps_pass = false;
     if (avoided || disturbs || intervals_.ends[interval_] < zero + (zero - t_)) {
         follow({*critical, closures.time_unit, !avoided});
         // A motion that is still to turn back is examined again.
-        if (prepared_.empty() && one_freedom_ && expected) known_ = false;
+        steps_pass = prepared_.empty() && one_freedom_;
     }
-    known_ = known_ || !prepared_.empty();
-    if (known_) examined.push_back({zero, critical->residual, avoided, !prepared_.empty()});
+    known_ = (known_ && !steps_pass) || !prepared_.empty();
+    const ExaminedPassage found{zero, critical->residual, avoided, !prepared_.empty()};
+    if (known_) examined.push_back(found);
+    if (steps_pass && !expected) unresolved_ = found;
+    if (steps_pass && avoided) avoided_ = *critical;
     return !prepared_.empty();
 }
 

@@ -108,6 +108,7 @@ struct StepRecords {
     field(bool, known)                                                             \
     field(bool, quiet)                                                             \
     field(double, examine_below)                                                   \
+    field(std::optional<CriticalConfiguration>, avoided)                           \
     field(std::optional<MotionAlongCurve>, passage)
 
 // Everything that the next step depends on.
@@ -179,6 +180,8 @@ private:
     bool leaves_closures_open(const StepResult& result);
     std::optional<double> crossing(const StepResult& result) const;
     bool examine(double zero, bool expected);
+    bool changes_curve(const StepResult& result);
+    bool avoids(const CriticalConfiguration& critical) const;
     double late_past_layers(const StepResult& result) const;
     bool misses_jump(const Proposal& proposal, const StepResult& result);
     void follow(MotionAlongCurve motion);
@@ -224,6 +227,11 @@ private:
     bool quiet_ = false;      // the last step was
     // sigma below which the motion is examined again, where no passage was found so far.
     double examine_below_ = infinity;
+    // The critical configuration that was examined last, if steps are to pass beside it.
+    std::optional<CriticalConfiguration> avoided_;
+    std::optional<ExaminedPassage> unresolved_;  // by the step that is made
+    double curve_limit_ = infinity;  // of a step that changed the curve
+    int curve_tries_ = 0;
     // Steps along a curve that are still to be made, the next one last, and their ends.
     std::vector<std::pair<StepResult, double>> prepared_;
     std::optional<MotionAlongCurve> passage_;  // one that is under way

@@ -363,7 +363,7 @@ void SplitStep::prepare_branch(const IntegratorState& memory, double end, double
 bool SplitStep::solve_on_branch(double t, double start, const double* state,
                                 const IntegratorState& memory) {
     if (result.lost_branch) return false;
-    if (!nodes_) nodes_.emplace(system_, constants);
+    if (!nodes_) nodes_.emplace(system_, constants, norm.singular);
     bool found = true, known = true;
     if (away_.empty()) {
         away_ = memory.history->away;

@@ -39,7 +39,8 @@ struct ButcherTableau {
     field(std::vector<double>, one)  /* (n,), a unit of each component */         \
     field(std::vector<double>, unit) /* (n,), its usual size */                   \
     field(double, rtol)                                                           \
-    field(double, negligible)        /* part of the tolerance; 0: fixed steps */
+    field(double, negligible)        /* part of the tolerance; 0: fixed steps */   \
+    field(double, singular)          /* residual (row units) that branches may have */
 
 // xi = sqrt(mean_i (e_i / (atol_i + rtol |x_i|))^2)
 struct ErrorNorm {

@@ -41,7 +41,9 @@ class CompiledBranchNodes(BranchNodes):
 
     def __init__(self, evaluator: Any) -> None:
         super().__init__(evaluator)
-        self._nodes = core.BranchNodes(evaluator.kernel_system, CONSTANTS)  # type: ignore[union-attr]
+        self._nodes = core.BranchNodes(  # type: ignore[union-attr]
+            evaluator.kernel_system, CONSTANTS, self._singular
+        )
 
     def solve(self, t: float, state: FloatArray, away: FloatArray) -> bool:
         """Solve the stage ``state`` (nx,) at t (s); whether it could be solved."""

@@ -183,6 +183,7 @@ def constants() -> Any:
         critical_farthest=critical_passages.FARTHEST,
         critical_passed=critical_passages.PASSED,
         rounded_residual=critical_passages.ROUNDED_RESIDUAL,
+        curve_tries=critical_passages.CURVE_TRIES,
         examined_again=critical_passages.EXAMINED_AGAIN,
         disturbing=critical_passages.DISTURBING,
         dependent_row=critical_passages.DEPENDENT,
@@ -243,6 +244,7 @@ def norm_struct(norm: ErrorNorm) -> Any:
         unit=norm.one if norm.unit is None else norm.unit,
         rtol=norm.rtol,
         negligible=norm.negligible,
+        singular=norm.singular,
     )
 
 

@@ -354,6 +354,7 @@ class CompiledRun:
                 known=False,
                 quiet=False,
                 examine_below=math.inf,
+                avoided=None,
                 passage=motion,
             )
         )

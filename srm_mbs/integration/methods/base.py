@@ -41,12 +41,16 @@ class ErrorNorm:
         steps, which have no tolerance.
     unit : (n,) or None
         Usual sizes of the tangent components; None for :attr:`one`.
+    singular
+        Residual (row units) of a configuration between nodes of a branch up to which the closures
+        have that branch; beyond it they avoid the singular configuration on it.
     """
 
     atol: FloatArray
     rtol: float
     negligible: float = NEGLIGIBLE
     unit: FloatArray | None = None
+    singular: float = np.inf
 
     @cached_property
     def one(self) -> FloatArray:

@@ -28,7 +28,7 @@ from contextlib import suppress
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.dynamics.system import BranchSystem, System, onto_closures
+from srm_mbs.dynamics.system import BranchSystem, BranchTerms, System, onto_closures
 from srm_mbs.errors import EvaluationError
 from srm_mbs.integration.methods.touching_branches import (
     StageOnBranch,
@@ -82,6 +82,8 @@ class BranchNodes(StageOnBranch):
     ----------
     finds_laws
         Whether the laws of forces are found as well.
+    singular
+        As of :class:`~srm_mbs.integration.methods.base.ErrorNorm`.
 
     Attributes
     ----------
@@ -90,8 +92,10 @@ class BranchNodes(StageOnBranch):
         F - M P M^-1 F, is smooth on the branch.
     """
 
-    def __init__(self, system: BranchSystem, finds_laws: bool = False) -> None:
-        self._system, self._finds_laws = system, finds_laws
+    def __init__(
+        self, system: BranchSystem, finds_laws: bool = False, singular: float = np.inf
+    ) -> None:
+        self._system, self._finds_laws, self._singular = system, finds_laws, singular
         self.laws = np.zeros(0)
 
     def _sigma_at(self, t: float, state: FloatArray, move: FloatArray) -> float:
@@ -187,6 +191,16 @@ class BranchNodes(StageOnBranch):
                 return node, closing, off
         return None
 
+    def _avoided(self, terms: BranchTerms) -> bool:
+        """Whether the closures between the nodes are open by more than a branch may be: they avoid
+        the singular configuration, and the nodes are on two curves.
+
+        sigma |E g| is the residual of the critical combination of rows, and not that of others."""
+        if not terms.constraint_residual() > self._singular:
+            return False
+        off = terms.correction()[: self._system.nv]
+        return terms.sigma * self._system.position_norm(off) > self._singular
+
     def solve(self, t: float, state: FloatArray, away: FloatArray) -> bool:
         """Solve the stage ``state`` (nx,) at t (s); whether it could be solved."""
         system, nv = self._system, self._system.nv
@@ -203,7 +217,10 @@ class BranchNodes(StageOnBranch):
         self.moved = np.concatenate([-_VALUE @ closings, _VALUE @ off])
         self.away = (away + _SLOPE @ closings)[None]
         self.state = system.retract(state, -self.moved)
-        free = system.evaluate(t, self.state).free_acceleration()
+        terms = system.evaluate(t, self.state)
+        if self._avoided(terms):
+            return False
+        free = terms.free_acceleration()
         joined = None
         if self._finds_laws:
             joined = system.joined_laws()
@@ -234,7 +251,7 @@ class StageNodes(BranchNodes):
         Start of the step (s) and the state there (nx,).
     direction : (1, nv), (f + 1, nv) or None
         That of :meth:`find_direction` there; None to find it when a stage needs it.
-    finds_laws
+    finds_laws, singular
         As for :class:`BranchNodes`.
 
     Attributes
@@ -252,8 +269,9 @@ class StageNodes(BranchNodes):
         state: FloatArray,
         direction: FloatArray | None,
         finds_laws: bool = False,
+        singular: float = np.inf,
     ) -> None:
-        super().__init__(system, finds_laws)
+        super().__init__(system, finds_laws, singular)
         self._start, self._direction = (t, state), direction
         self._touching: TouchingBranch | None = None
         self.used = self.lost = False
@@ -290,10 +308,13 @@ class StageNodes(BranchNodes):
         return self._touching.solve(t, state, self)
 
 
-def onto_closed_branch(system: System, t: float, state: FloatArray) -> FloatArray:
+def onto_closed_branch(
+    system: System, t: float, state: FloatArray, singular: float = np.inf
+) -> FloatArray:
     """``state`` (nx,) moved along the normals onto the closures, or next to a singular
     configuration onto its branch, velocities by the M-orthogonal projection.
 
+    ``singular`` is as of :class:`~srm_mbs.integration.methods.base.ErrorNorm`.
     At a distance d from the singular configuration, the normals of the closures at a state that is
     e off the branch are turned by e / d against those of the branch.
 
@@ -306,7 +327,7 @@ def onto_closed_branch(system: System, t: float, state: FloatArray) -> FloatArra
     if branch_system is not None:
         with suppress(EvaluationError):  # the projection meets it, or does without
             if branch_system.evaluate(t, state).sigma < BRANCH_SIGMA:
-                nodes = StageNodes(branch_system, t, state, None)
+                nodes = StageNodes(branch_system, t, state, None, singular=singular)
                 if nodes.solve_stage(t, state):
                     return nodes.state
     return onto_closures(system, t, state)

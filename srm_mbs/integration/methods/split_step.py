@@ -149,7 +149,7 @@ class SplitStep:
             branch_system = system.branch_system
             if memory.lingering and self.uses_nodes and branch_system is not None:
                 implicit = scheme.implicit is not None
-                nodes = StageNodes(branch_system, t, state, history.away, implicit)
+                nodes = StageNodes(branch_system, t, state, history.away, implicit, norm.singular)
             lingers = nodes is not None
             branch = BranchStages(
                 system, memory, norm, weights, h, sigma_change, history, t + h, lingering=lingers

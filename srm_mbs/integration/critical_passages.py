@@ -17,6 +17,7 @@ itself.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -740,21 +741,31 @@ def layer_motion(
     return PlaceOnCurve(critical, False, curve, begin, curve.beta, energy)
 
 
-def _changes_curve(critical: CriticalConfiguration, begin: FloatArray, end: FloatArray) -> bool:
-    """Whether the places ``begin`` and ``end`` are on the two curves beside a ``critical``
-    configuration; not, if its hyperbolas do not tell."""
-    sides = []
+class StepBeside(Enum):
+    """Where a step leads beside a critical configuration that the closures avoid."""
+
+    UNKNOWN = "not told by the hyperbolas"
+    STAYS = "along its curve, on one side"
+    PASSES = "along its curve, past the critical configuration"
+    CHANGES = "to the other curve"
+
+
+def _step_beside(critical: CriticalConfiguration, begin: FloatArray, end: FloatArray) -> StepBeside:
+    sides, betas = [], []
     for place in (begin, end):
         try:
             curve = CurveThroughSaddle(critical, place, False)
         except (ValueError, np.linalg.LinAlgError):
-            return False
+            return StepBeside.UNKNOWN
         on, away = curve.hyperbola(curve.beta)[0], critical.geometry.difference(critical.q, place)
         kept = on - curve.beta * curve.along
         if not np.linalg.norm(away - on) < LARGEST_DEVIATION * np.linalg.norm(kept):
-            return False
+            return StepBeside.UNKNOWN
         sides.append(kept)
-    return float(sides[0] @ sides[1]) < 0.0
+        betas.append(curve.beta)
+    if float(sides[0] @ sides[1]) < 0.0:
+        return StepBeside.CHANGES
+    return StepBeside.PASSES if betas[0] * betas[1] < 0.0 else StepBeside.STAYS
 
 
 class CriticalPassages:
@@ -831,14 +842,28 @@ class CriticalPassages:
         return None if self._quiet and not self._one_freedom else zero
 
     def changes_curve(self, state: FloatArray, result: StepResult) -> bool:
-        """Whether the step of ``result`` from ``state`` (nx,) leads to the other one of the curves
-        beside a critical configuration that the closures avoid; the next step is shorter then.
-
-        That is the one that steps were to pass, or one to which a step turns back that started as
-        near to it as it comes again.
-        """
-        if not self._one_freedom or result.quiet or not may_cross(result):
+        """Whether the step of ``result`` from ``state`` (nx,) is to be made again, shorter: it
+        leads to the other one of the curves beside a critical configuration."""
+        beside = self._beside(state, result)
+        if beside is StepBeside.STAYS:
+            self._unresolved = None
+        if beside is not StepBeside.CHANGES or self._avoided is None:
             return False
+        if self._tries == CURVE_TRIES:
+            self._unresolved = ExaminedPassage(
+                result.t, self._avoided.residual, avoided=True, resolved=False
+            )
+            return False
+        self.curve_limit = 0.5 * result.h
+        self._tries += 1
+        return True
+
+    def _beside(self, state: FloatArray, result: StepResult) -> StepBeside:
+        """Where the step of ``result`` from ``state`` (nx,) leads beside the critical configuration
+        that steps were to pass, or beside the one to which it turns back, if it started as near to
+        that as it comes again."""
+        if not self._one_freedom or result.quiet or not may_cross(result):
+            return StepBeside.UNKNOWN
         system = self._system
         analysis = system.singularities
         geometry = analysis.geometry(analysis.q0, result.t)
@@ -852,23 +877,16 @@ class CriticalPassages:
                 for rate in (result.rates[0], result.end_rate)
             )
             if not float(before @ after) < 0.0:
-                return False
+                return StepBeside.UNKNOWN
             critical = critical_configuration(
                 geometry, analysis.rank, begin, SEARCH, self._found, ROUNDED_RESIDUAL
             )
             if critical is not None and not self._avoids(critical):
                 critical = None
             self._avoided = critical
-        if self._avoided is None or not _changes_curve(self._avoided, begin, end):
-            return False
-        if self._tries == CURVE_TRIES:
-            self._unresolved = ExaminedPassage(
-                result.t, self._avoided.residual, avoided=True, resolved=False
-            )
-            return False
-        self.curve_limit = 0.5 * result.h
-        self._tries += 1
-        return True
+        if self._avoided is None:
+            return StepBeside.UNKNOWN
+        return _step_beside(self._avoided, begin, end)
 
     def _avoids(self, critical: CriticalConfiguration) -> bool:
         return abs(critical.residual) > max(self._tolerance, ROUNDED_RESIDUAL)
@@ -944,12 +962,12 @@ class CriticalPassages:
                 # Steps pass it as well as they can, and the message says so.  A motion that has
                 # still to turn back is examined again.
                 steps_pass = self._one_freedom
-        self._known = self._known and not steps_pass
         found = ExaminedPassage(zero, residual, avoided, bool(steps))
+        if self._known and steps_pass and not expected:
+            self._unresolved = found
+        self._known = self._known and not steps_pass
         if self._known or steps:
             self.examined.append(found)
-        if steps_pass and not expected:
-            self._unresolved = found
         if steps_pass and avoided:
             self._avoided = critical
         return steps

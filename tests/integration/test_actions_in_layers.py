@@ -232,6 +232,7 @@ def test_a_motion_that_turns_back_soon_beyond_a_layer_returns_through_it(
     back = srm.Event(lambda t, q, v: q[0] - ideal.q0[0], direction=-1, terminal=True)
     solution = srm.simulate(mechanism, 3.0, rtol=rtol, events=back, backend=backend, **EXACT)
     assert solution.status == "event", solution.message
+    assert "may not have resolved" not in solution.message
     assert [passage.kind for passage in solution.crossings] == ["avoided", "avoided"]
     np.testing.assert_allclose(solution.q[-1], mechanism.q0, atol=10.0 * rtol)
     np.testing.assert_allclose(solution.v[-1], -mechanism.v0, atol=30.0 * rtol)

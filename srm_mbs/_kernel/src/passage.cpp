@@ -120,11 +120,11 @@ public:
         if (!(norm(away.data(), n_) < largest_deviation_ * distance)) throw NoPassage{};
     }
 
-    // The sign of the kept coordinate of a place; 0 if the hyperbola does not tell it.
-    int side_of(const Vector& x, double t) {
+    // The sign of the kept coordinate of a place, at beta; 0 if the hyperbola does not tell it.
+    int side_of(const Vector& x, double t, double& at) {
         Vector away(n_);
         closures_.difference(critical_.x, critical_.t, x, t, away.data());
-        const double at = dot(along.data(), away.data(), n_);
+        at = dot(along.data(), away.data(), n_);
         const int sign = dot(kept_.data(), away.data(), n_) > 0.0 ? 1 : -1;
         const double kept = std::sqrt(level_ + ratio_ * at * at);
         add(-at, along.data(), away.data(), n_);
@@ -782,15 +782,19 @@ std::optional<MotionAlongCurve> motion_in_layer(System& system, double t,
     }
 }
 
-bool changes_curve(UnitClosures& closures, const CriticalConfiguration& critical, double t,
-                   const std::vector<double>& state, double t_end,
-                   const std::vector<double>& end, const Constants& constants) {
+StepBeside step_beside(UnitClosures& closures, const CriticalConfiguration& critical, double t,
+                       const std::vector<double>& state, double t_end,
+                       const std::vector<double>& end, const Constants& constants) {
     const MotionAlongCurve motion{critical, closures.time_unit, false};
     try {
         SaddleCurve curve(closures, motion, state, t, constants);
-        return curve.side_of(state, t) * curve.side_of(end, t_end) < 0;
+        double first, last;
+        const int sides = curve.side_of(state, t, first) * curve.side_of(end, t_end, last);
+        if (sides == 0) return StepBeside::unknown;
+        if (sides < 0) return StepBeside::changes;
+        return first * last < 0.0 ? StepBeside::passes : StepBeside::stays;
     } catch (const NoPassage&) {
-        return false;
+        return StepBeside::unknown;
     }
 }
 

@@ -55,10 +55,11 @@ std::optional<MotionAlongCurve> motion_in_layer(System& system, double t,
                                                 double tolerance, double reach,
                                                 const Constants& constants);
 
-// Whether a step of one degree of freedom leads from one of the curves beside a critical configuration
-// to the other: changes_curve() of integration/critical_passages.py.
-bool changes_curve(UnitClosures& closures, const CriticalConfiguration& critical, double t,
-                   const std::vector<double>& state, double t_end,
-                   const std::vector<double>& end, const Constants& constants);
+// StepBeside of integration/critical_passages.py.
+enum class StepBeside { unknown, stays, passes, changes };
+
+StepBeside step_beside(UnitClosures& closures, const CriticalConfiguration& critical, double t,
+                       const std::vector<double>& state, double t_end,
+                       const std::vector<double>& end, const Constants& constants);
 
 }  // namespace srm

@@ -288,13 +288,16 @@ Stop Run::attempt(StepDecision& decision) {
     if (result && examines_) {
         const std::optional<double> zero = crossing(*result);
         if (zero && examine(*zero, false)) return make_prepared();
-        if (changes_curve(*result)) {
+        const StepBeside step_beside = beside(*result);
+        if (step_beside == StepBeside::changes) {
             if (curve_tries_ < constants().curve_tries) {
                 curve_limit_ = 0.5 * h;
                 ++curve_tries_;
                 return Stop::chunk;
             }
             unresolved_ = ExaminedPassage{t_, avoided_->residual, true, false};
+        } else if (step_beside == StepBeside::stays) {
+            unresolved_.reset();
         }
     }
     if (result && misses_jump(proposal, *result)) return Stop::chunk;
@@ -377,24 +380,23 @@ std::optional<double> Run::crossing(const StepResult& r) const {
     return r.t + (inside ? zero : abscissae[low - r.sigmas.begin()]) * r.h;
 }
 
-// Whether the step leads to the other one of the curves beside a critical configuration:
-// CriticalPassages.changes_curve in integration/critical_passages.py.
-bool Run::changes_curve(const StepResult& r) {
-    if (!one_freedom_ || r.quiet || !control->adaptive) return false;
+// CriticalPassages.beside in integration/critical_passages.py.
+StepBeside Run::beside(const StepResult& r) {
+    if (!one_freedom_ || r.quiet || !control->adaptive) return StepBeside::unknown;
     const auto [low, high] = std::minmax_element(r.sigmas.begin(), r.sigmas.end());
-    if (!(2.0 * *low < *high)) return false;
+    if (!(2.0 * *low < *high)) return StepBeside::unknown;
     UnitClosures closures(system, r.h);
     if (low == r.sigmas.begin()) {
         const double* before = memory.rate.data();
         double turned = 0.0;
         for (int i = 0; i < system.nv; ++i)
             turned += before[i] * r.end_rate[i] / (system.unit(i) * system.unit(i));
-        if (!(turned < 0.0)) return false;
+        if (!(turned < 0.0)) return StepBeside::unknown;
         avoided_ = critical_of_passage(closures, t_, state.data(), before, t_, constants());
         if (avoided_ && !avoids(*avoided_)) avoided_.reset();
     }
-    return avoided_ && srm::changes_curve(closures, *avoided_, t_, state, r.t + r.h, r.state,
-                                          constants());
+    if (!avoided_) return StepBeside::unknown;
+    return step_beside(closures, *avoided_, t_, state, r.t + r.h, r.state, constants());
 }
 
 bool Run::avoids(const CriticalConfiguration& critical) const {
@@ -432,10 +434,10 @@ bool Run::examine(double zero, bool expected) {
         // A motion that is still to turn back is examined again.
         steps_pass = prepared_.empty() && one_freedom_;
     }
-    known_ = (known_ && !steps_pass) || !prepared_.empty();
     const ExaminedPassage found{zero, critical->residual, avoided, !prepared_.empty()};
+    if (known_ && steps_pass && !expected) unresolved_ = found;
+    known_ = (known_ && !steps_pass) || !prepared_.empty();
     if (known_) examined.push_back(found);
-    if (steps_pass && !expected) unresolved_ = found;
     if (steps_pass && avoided) avoided_ = *critical;
     return !prepared_.empty();
 }

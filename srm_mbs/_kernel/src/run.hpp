@@ -180,7 +180,7 @@ private:
     bool leaves_closures_open(const StepResult& result);
     std::optional<double> crossing(const StepResult& result) const;
     bool examine(double zero, bool expected);
-    bool changes_curve(const StepResult& result);
+    StepBeside beside(const StepResult& result);
     bool avoids(const CriticalConfiguration& critical) const;
     double late_past_layers(const StepResult& result) const;
     bool misses_jump(const Proposal& proposal, const StepResult& result);

@@ -53,14 +53,17 @@ FARTHEST = 1.5
 another one may lie between."""
 EXAMINED_AGAIN = 0.7
 """Fall of sigma after which a motion that passes no critical configuration so far is examined
-again."""
+again; with a dead point ahead, the lowest over the last one in a step that leads past it."""
 ROUNDED_RESIDUAL = 1e-13
 """Residual (row units) below which the configuration is singular to rounding."""
 DISTURBING = 1e-3
 """Residual that counts as zero, over rtol, up to which steps pass as if it were, unless they are
 to end beside the passage."""
-CURVE_TRIES = 12
-"""Halvings of a step that leads to the other curve."""
+DEAD_POINT_WIDTH = 1e-2
+"""Width (units) of a layer up to which dead points of drives are looked for in it: steps stop at
+others."""
+DEAD_POINT_WIDTHS = 100.0
+"""Distance from its middle, over the width, at which the curve is earlier than there."""
 WIDE = 0.5 * SEARCH**2
 """Residual (row units) from which the layer, of sqrt(2 |delta|) where H is 1, is as wide as that:
 steps resolve it."""
@@ -116,6 +119,9 @@ SHORTENED = 0.5
 LEAST_ENERGY = 0.75
 """Least kinetic energy on a panel outside of the layer, over the largest, from which polynomials on
 it resolve the time: the rate of that grows without bound where the motion turns back."""
+FALLING_SIGMA = 0.5
+"""sigma beyond the layer, over the largest one on a panel before, below which the curve comes to
+another layer."""
 SMALLEST_REST = 1e-9
 """Rest of a passage, over its whole, that is none."""
 
@@ -585,6 +591,10 @@ class PassageAlongCurve:
             raise ValueError("the collocation does not converge")
         for before, node in pairwise([self._found[-1][0], *nodes]):
             self._check_neighbours(before, node)
+        if a >= LAYER:
+            sigmas = np.array([node.sigma for node in (self._found[-1][0], *nodes)])
+            if (sigmas < FALLING_SIGMA * np.maximum.accumulate(sigmas)).any():
+                raise ValueError("the curve comes to another layer")
         energy, t = energies[:-1], times[:-1]
         begin, energy_at_begin = self._clock, self._energy
         self._energy, self._clock = float(energies[-1]), float(times[-1])
@@ -741,6 +751,20 @@ def layer_motion(
     return PlaceOnCurve(critical, False, curve, begin, curve.beta, energy)
 
 
+def leads_to_dead_point(critical: CriticalConfiguration, place: FloatArray) -> bool:
+    """Whether drives lead the motion at ``place`` to a dead point in the layer of a ``critical``
+    configuration: the curve turns back in time there."""
+    try:
+        curve = CurveThroughSaddle(critical, place, False)
+    except (ValueError, np.linalg.LinAlgError):
+        return False
+    if not curve.width < DEAD_POINT_WIDTH:
+        return False
+    far = DEAD_POINT_WIDTHS * curve.width
+    before, middle, after = (float(curve.hyperbola(x)[0][-1]) for x in (-far, 0.0, far))
+    return max(before, after) < middle
+
+
 class StepBeside(Enum):
     """Where a step leads beside a critical configuration that the closures avoid."""
 
@@ -797,7 +821,7 @@ class CriticalPassages:
         self._found: list[CriticalConfiguration] = []
         self._avoided: CriticalConfiguration | None = None
         self._unresolved: ExaminedPassage | None = None
-        self._tries = 0
+        self._dead_end = False
         self.curve_limit = np.inf
         self.examined: list[ExaminedPassage] = []
 
@@ -847,22 +871,20 @@ class CriticalPassages:
         beside = self._beside(state, result)
         if beside is StepBeside.STAYS:
             self._unresolved = None
-        if beside is not StepBeside.CHANGES or self._avoided is None:
-            return False
-        if self._tries == CURVE_TRIES:
-            self._unresolved = ExaminedPassage(
-                result.t, self._avoided.residual, avoided=True, resolved=False
-            )
+        if beside is not StepBeside.CHANGES:
             return False
         self.curve_limit = 0.5 * result.h
-        self._tries += 1
         return True
 
     def _beside(self, state: FloatArray, result: StepResult) -> StepBeside:
         """Where the step of ``result`` from ``state`` (nx,) leads beside the critical configuration
         that steps were to pass, or beside the one to which it turns back, if it started as near to
         that as it comes again."""
-        if not self._one_freedom or result.quiet or not may_cross(result):
+        if not self._one_freedom or result.quiet:
+            return StepBeside.UNKNOWN
+        if self._dead_end and result.sigmas.min() < EXAMINED_AGAIN * result.sigmas[-1]:
+            return StepBeside.CHANGES  # up to the dead point sigma falls
+        if not may_cross(result):
             return StepBeside.UNKNOWN
         system = self._system
         analysis = system.singularities
@@ -894,7 +916,8 @@ class CriticalPassages:
     def accepted(self, result: StepResult) -> None:
         """A step was accepted: where sigma rises, the next passage is another one."""
         self._quiet, self._sigma = result.quiet, float(result.sigmas[-1])
-        self.curve_limit, self._tries = np.inf, 0
+        self.curve_limit = np.inf
+        self._dead_end = self._dead_end and not result.quiet
         if self._unresolved is not None:
             self.examined.append(self._unresolved)
         if result.sigmas[-1] > result.sigmas[0]:
@@ -970,6 +993,10 @@ class CriticalPassages:
             self.examined.append(found)
         if steps_pass and avoided:
             self._avoided = critical
+            if geometry.drives and leads_to_dead_point(critical, begin):
+                self._dead_end = True
+        if steps:
+            self._dead_end = False
         return steps
 
     def steps_on(self, t: float, state: FloatArray, end: float) -> list[tuple[StepResult, float]]:

@@ -6,10 +6,13 @@ The reference is the closed form of their motion, without closures and without P
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import srm_mbs as srm
+from tests.support.backends import on_both
 from tests.support.change_point import CHANGE_POINTS, AlmostChangePoint
 
 T_END = 5.0
@@ -72,3 +75,24 @@ def test_a_four_bar_meets_its_change_points_several_times() -> None:
         run = srm.simulate(four_bar.mechanism(), T_END, singular_tolerance=0.0)
         assert len(run.crossings) >= 8
         assert {passage.kind for passage in run.crossings} == {"avoided"}
+
+
+@on_both
+@pytest.mark.parametrize(
+    ("name", "d", "rtol", "end"),
+    [
+        ("folded", -1e-11, 1e-4, 2.0 * np.pi),
+        ("parallelogram", -5e-11, 1e-4, np.pi),
+        ("parallelogram", -1e-7, 1e-6, np.pi),
+    ],
+)
+def test_a_driven_crank_stops_at_its_dead_point_in_a_layer(
+    name: str, d: float, rtol: float, end: float, backend: str
+) -> None:
+    """The crank of a shorter coupler cannot turn past its change point: there is nothing beyond."""
+    ideal = AlmostChangePoint(*CHANGE_POINTS[name], d, start=1.3, speed=3.0).mechanism()
+    mechanism = replace(ideal, drives=(srm.Drive(srm.ConstantSpeed(3.0), "crank"),))
+    with pytest.warns(srm.SrmWarning, match="Stopped"):
+        run = srm.simulate(mechanism, 2.0, rtol=rtol, singular_tolerance=0.0, backend=backend)
+    assert run.q[-1, 0] == pytest.approx(end, abs=2.0 * np.sqrt(abs(d)))
+    assert run.message.startswith("Stopped")

@@ -121,7 +121,9 @@ namespace srm {
     field(double, critical_reach)          /* of the search (units) */                             \
     field(double, critical_farthest)       /* distance (units) from which a motion waits */        \
     field(double, critical_passed)         /* distance that is a passage, over that of the start */ \
-    field(int, curve_tries)                /* halvings of a step that changes the curve */         \
+    field(double, falling_sigma)           /* over the largest one, before another layer */        \
+    field(double, dead_point_width)        /* of a layer, at most */                               \
+    field(double, dead_point_widths)       /* at which the curve is earlier than in the middle */  \
     field(double, rounded_residual)        /* that of a singular configuration (row units) */      \
     field(double, examined_again)          /* fall of sigma after a search without a passage */    \
     field(double, disturbing)              /* one that counts as zero and disturbs, over rtol */   \

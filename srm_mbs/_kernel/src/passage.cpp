@@ -492,6 +492,15 @@ private:
             throw NoPassage{};
     }
 
+    // Refuses nodes beyond the layer at which sigma falls: the curve comes to another one.
+    void check_sigmas(const std::vector<Node>& nodes) const {
+        double most = found_.back().node.sigma;
+        for (const Node& node : nodes) {
+            most = std::max(most, node.sigma);
+            if (node.sigma < constants_.falling_sigma * most) throw NoPassage{};
+        }
+    }
+
     // Goes on from `at` to the edge, of xi times the heading; returns where that led.  Beyond the
     // layer that may be less, where the motion turns back soon.  Where the energy changes much, panels
     // are shorter.
@@ -575,6 +584,7 @@ private:
         }
         for (int i = 0; i < count_; ++i)
             check_neighbours(i ? nodes[i - 1] : found_.back().node, nodes[i]);
+        if (a >= constants_.layer) check_sigmas(nodes);
         const double begin = clock_, energy_before = energy_;
         energy_ = energies[count_];
         clock_ = times[count_];
@@ -779,6 +789,25 @@ std::optional<MotionAlongCurve> motion_in_layer(System& system, double t,
         return {};
     } catch (const EvaluationError&) {
         return {};
+    }
+}
+
+bool leads_to_dead_point(UnitClosures& closures, const CriticalConfiguration& critical, double t,
+                         const std::vector<double>& state, const Constants& constants) {
+    if (!closures.system.driven()) return false;
+    const MotionAlongCurve motion{critical, closures.time_unit, false};
+    try {
+        const SaddleCurve curve(closures, motion, state, t, constants);
+        if (!(curve.width < constants.dead_point_width)) return false;
+        Vector away(closures.n), slope(closures.n);
+        const auto time = [&](double beta) {
+            curve.hyperbola(beta, away, slope);
+            return away.back();
+        };
+        const double far = constants.dead_point_widths * curve.width;
+        return std::max(time(far), time(-far)) < time(0.0);
+    } catch (const NoPassage&) {
+        return false;
     }
 }
 

@@ -62,4 +62,9 @@ StepBeside step_beside(UnitClosures& closures, const CriticalConfiguration& crit
                        const std::vector<double>& state, double t_end,
                        const std::vector<double>& end, const Constants& constants);
 
+// Whether drives lead a motion to a dead point in a layer: leads_to_dead_point() of
+// integration/critical_passages.py.
+bool leads_to_dead_point(UnitClosures& closures, const CriticalConfiguration& critical, double t,
+                         const std::vector<double>& state, const Constants& constants);
+
 }  // namespace srm

@@ -213,7 +213,6 @@ void Run::resume(double t, const std::vector<double>& from, IntegratorState know
     prepared_.clear();
     passage_.reset();
     curve_limit_ = infinity;
-    curve_tries_ = 0;
     memory = std::move(known);
     control->resume(known_control);
     const bool enters = interval_ > 0 && t == ends[interval_ - 1];
@@ -232,6 +231,7 @@ RunSnapshot Run::snapshot() const {
     out.quiet = quiet_;
     out.examine_below = examine_below_;
     out.avoided = avoided_;
+    out.dead_end = dead_end_;
     out.passage = passage_;
     return out;
 }
@@ -244,6 +244,7 @@ void Run::restore(const RunSnapshot& snapshot) {
     quiet_ = snapshot.quiet;
     examine_below_ = snapshot.examine_below;
     avoided_ = snapshot.avoided;
+    dead_end_ = snapshot.dead_end;
     passage_ = snapshot.passage;
 }
 
@@ -290,15 +291,10 @@ Stop Run::attempt(StepDecision& decision) {
         if (zero && examine(*zero, false)) return make_prepared();
         const StepBeside step_beside = beside(*result);
         if (step_beside == StepBeside::changes) {
-            if (curve_tries_ < constants().curve_tries) {
-                curve_limit_ = 0.5 * h;
-                ++curve_tries_;
-                return Stop::chunk;
-            }
-            unresolved_ = ExaminedPassage{t_, avoided_->residual, true, false};
-        } else if (step_beside == StepBeside::stays) {
-            unresolved_.reset();
+            curve_limit_ = 0.5 * h;
+            return Stop::chunk;
         }
+        if (step_beside == StepBeside::stays) unresolved_.reset();
     }
     if (result && misses_jump(proposal, *result)) return Stop::chunk;
     decision = control->decide(proposal, result);
@@ -311,6 +307,7 @@ Stop Run::attempt(StepDecision& decision) {
     }
     evaluation_failed = false;
     quiet_ = result->quiet;
+    dead_end_ = dead_end_ && !quiet_;
     // Where sigma rises, the next passage is another one.
     if (result->sigmas.back() > result->sigmas.front()) {
         known_ = false;
@@ -323,7 +320,7 @@ Stop Run::attempt(StepDecision& decision) {
     record(*result, proposal.t_new, placement);
     const bool jumped = on_jump_;
     jump_limit_ = rest_limit_ = curve_limit_ = infinity;
-    jump_tries_ = curve_tries_ = 0;
+    jump_tries_ = 0;
     on_jump_ = false;
     inaccurate_ = jumped && t_ < interval_end() && !restart_after_break();
     return t_ < t_end() ? Stop::chunk : Stop::finished;
@@ -384,6 +381,9 @@ std::optional<double> Run::crossing(const StepResult& r) const {
 StepBeside Run::beside(const StepResult& r) {
     if (!one_freedom_ || r.quiet || !control->adaptive) return StepBeside::unknown;
     const auto [low, high] = std::minmax_element(r.sigmas.begin(), r.sigmas.end());
+    // Up to the dead point sigma falls.
+    if (dead_end_ && *low < constants().examined_again * r.sigmas.back())
+        return StepBeside::changes;
     if (!(2.0 * *low < *high)) return StepBeside::unknown;
     UnitClosures closures(system, r.h);
     if (low == r.sigmas.begin()) {
@@ -438,7 +438,11 @@ bool Run::examine(double zero, bool expected) {
     if (known_ && steps_pass && !expected) unresolved_ = found;
     known_ = (known_ && !steps_pass) || !prepared_.empty();
     if (known_) examined.push_back(found);
-    if (steps_pass && avoided) avoided_ = *critical;
+    if (steps_pass && avoided) {
+        avoided_ = *critical;
+        if (leads_to_dead_point(closures, *critical, t_, state, constants())) dead_end_ = true;
+    }
+    if (!prepared_.empty()) dead_end_ = false;
     return !prepared_.empty();
 }
 

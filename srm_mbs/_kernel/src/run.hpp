@@ -109,6 +109,7 @@ struct StepRecords {
     field(bool, quiet)                                                             \
     field(double, examine_below)                                                   \
     field(std::optional<CriticalConfiguration>, avoided)                           \
+    field(bool, dead_end)                                                          \
     field(std::optional<MotionAlongCurve>, passage)
 
 // Everything that the next step depends on.
@@ -229,9 +230,9 @@ private:
     double examine_below_ = infinity;
     // The critical configuration that was examined last, if steps are to pass beside it.
     std::optional<CriticalConfiguration> avoided_;
+    bool dead_end_ = false;  // drives lead to a dead point in a layer
     std::optional<ExaminedPassage> unresolved_;  // by the step that is made
     double curve_limit_ = infinity;  // of a step that changed the curve
-    int curve_tries_ = 0;
     // Steps along a curve that are still to be made, the next one last, and their ends.
     std::vector<std::pair<StepResult, double>> prepared_;
     std::optional<MotionAlongCurve> passage_;  // one that is under way

@@ -355,6 +355,7 @@ class CompiledRun:
                 quiet=False,
                 examine_below=math.inf,
                 avoided=None,
+                dead_end=False,
                 passage=motion,
             )
         )

@@ -880,7 +880,7 @@ class CriticalPassages:
         """Where the step of ``result`` from ``state`` (nx,) leads beside the critical configuration
         that steps were to pass, or beside the one to which it turns back, if it started as near to
         that as it comes again."""
-        if not self._one_freedom or result.quiet:
+        if not self._one_freedom:
             return StepBeside.UNKNOWN
         if self._dead_end and result.sigmas.min() < EXAMINED_AGAIN * result.sigmas[-1]:
             return StepBeside.CHANGES  # up to the dead point sigma falls

@@ -379,7 +379,7 @@ std::optional<double> Run::crossing(const StepResult& r) const {
 
 // CriticalPassages.beside in integration/critical_passages.py.
 StepBeside Run::beside(const StepResult& r) {
-    if (!one_freedom_ || r.quiet || !control->adaptive) return StepBeside::unknown;
+    if (!one_freedom_ || !control->adaptive) return StepBeside::unknown;
     const auto [low, high] = std::minmax_element(r.sigmas.begin(), r.sigmas.end());
     // Up to the dead point sigma falls.
     if (dead_end_ && *low < constants().examined_again * r.sigmas.back())

@@ -229,3 +229,464 @@ def test_steps_of_a_simulator_count_and_it_stays_with_its_backend(
 def _stepped(mechanism: srm.Mechanism, by: str) -> np.ndarray:
     simulator = srm.Simulator(mechanism, backend=by)
     return np.array([simulator.step(0.01)[0] for _ in range(200)])
+
+
+def test_a_long_run_begins_the_compilation_and_stays_with_its_backend() -> None:
+    mechanism = srm.load("four_bar")
+
+    def event(t: float, q: np.ndarray, v: np.ndarray) -> float:
+        if policy._job is not None:
+            process = policy._job.compilation._processes[0]
+            assert process is not None
+            process.wait()
+        if code.arrivals():
+            arrived.append(t)
+        return 1.0
+
+    arrived: list[float] = []
+    solution = finished(mechanism, 20.0, events=event)
+    assert 0.0 < arrived[0] < 10.0
+    assert solution.settings.backend == "kernel"
+    expected = finished(mechanism, 20.0, events=lambda t, q, v: 1.0, backend="kernel")
+    assert np.array_equal(solution.q, expected.q)
+    assert finished(mechanism, 0.1).settings.backend == "generated"
+
+
+def test_segments_of_a_run_keep_its_backend_while_code_arrives() -> None:
+    mechanism = srm.load("four_bar")
+
+    def bounce(t: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if t > 1.0:
+            srm.compile(mechanism)
+        return q, v
+
+    crossing = srm.Event(lambda t, q, v: np.sin(8.0 * t), action=bounce)
+    solution = finished(mechanism, 3.0, events=crossing)
+    assert len(solution.segments) > 3
+    assert {part.settings.backend for part in solution.segments} == {"kernel"}
+    assert finished(mechanism, 3.0, events=crossing).settings.backend == "generated"
+
+
+def test_a_run_with_code_stays_with_its_backend_where_it_switches_the_mechanism(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(policy, "START_SECONDS", 1e3)  # nothing is compiled without being asked
+    mechanism = srm.load("four_bar")
+    free = mechanism.without_loop(mechanism.loops[0].name)
+    release = srm.Event(
+        lambda t, q, v: t - 0.5, terminal=False, action=lambda t, q, v: srm.Switch(free, q, v)
+    )
+    assert finished(mechanism, 1.0, events=release).settings.backend == "kernel"
+    srm.compile(mechanism)
+    assert srm.backend(free) == "kernel"
+    solution = finished(mechanism, 1.0, events=release)
+    assert [part.settings.backend for part in solution.segments] == ["generated"] * 2
+    again = finished(mechanism, 1.0, events=release, backend="generated")
+    assert np.array_equal(again.q, solution.q)
+
+
+def test_steps_of_a_run_with_output_times_are_made_again_by_its_backend() -> None:
+    mechanism = srm.load("four_bar")
+    times = np.linspace(0.0, 2.0, 2001)
+    solution = finished(mechanism, 2.0, t_eval=times)
+    expected = finished(mechanism, 2.0, backend="kernel")
+    srm.compile(mechanism)
+    assert np.array_equal(solution(1.2345)[0], expected(1.2345)[0])
+    assert finished(mechanism, 2.0, t_eval=times).settings.backend == "generated"
+
+
+@pytest.mark.parametrize(
+    "script",
+    ["exit 1", "exit 0", 'while [ "$1" != -o ]; do shift; done; echo rubbish > "$2"'],
+    ids=["fails", "makes nothing", "makes rubbish"],
+)
+def test_runs_go_on_with_the_kernel_where_the_compiler_fails(
+    program: Callable[[str], Path], script: str, folder: Path
+) -> None:
+    calls = program(script)
+    mechanism = srm.load("four_bar")
+    started = time.monotonic()
+    while not policy._failed and time.monotonic() - started < PATIENCE:
+        _no_code(mechanism, 1)
+    _no_code(mechanism)
+    _no_code(_used("slider_crank"), 5)
+    assert calls.read_text().count("\n") == 1  # it is asked once per process
+    assert not [path.name for path in folder.iterdir() if path.name.startswith(code_cache._WORK)]
+
+
+def test_runs_go_on_with_the_kernel_while_the_compiler_hangs(
+    program: Callable[[str], Path], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(code, "PATIENCE", 1.0)
+    calls = program("sleep 100")
+    mechanism = _used()
+    started = time.monotonic()
+    while not policy._failed and time.monotonic() - started < PATIENCE:
+        _no_code(mechanism, 1)
+    assert time.monotonic() - started > 1.0
+    assert not _alive(int(calls.read_text()))
+    assert not list(folder.iterdir())
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def _wait_for(condition: Callable[[], object]) -> None:
+    started = time.monotonic()
+    while not condition():
+        assert time.monotonic() - started < PATIENCE
+        time.sleep(0.01)
+
+
+def test_without_a_compiler_nothing_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (code_cache, backend):
+        monkeypatch.setattr(module, "compiler", lambda: None)
+    mechanism = srm.load("four_bar")
+    _no_code(mechanism, 5)
+    assert policy._use_of(mechanism).account.used == 0.0
+    assert row(run("info", "four_bar"), "generated code") == "none: there is no C compiler"
+
+
+def test_the_kernel_alone_can_be_asked_for(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    srm.compile(srm.load("four_bar"))
+    mechanism = srm.load("four_bar")
+    assert "s, or by srm-mbs compile" in row(run("info", "slider_crank"), "generated code")
+    assert row(run("info", "four_bar"), "generated code") == "compiled"
+    monkeypatch.setenv("SRM_MBS_BACKEND", "kernel")
+    _no_code(mechanism, 3)
+    assert srm.backend(mechanism) == "kernel"
+    assert row(run("info", "four_bar"), "runs on") == "the compiled kernel"
+    assert "SRM_MBS_BACKEND is kernel" in row(run("info", "four_bar"), "generated code")
+
+
+def _egg() -> srm.Mechanism:
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelEllipsoid(1.0, 2.0, 3.0), pin.SE3.Identity(), "egg")
+    model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
+    return srm.Mechanism(model, q0=pin.neutral(model), v0=np.full(3, 0.1))
+
+
+@pytest.mark.parametrize("case", ["an element", "too many statements"])
+def test_what_cannot_be_generated_is_tried_once(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    tries: list[str] = []
+    for name in ("structure_of", "source_of"):
+        made = getattr(code, name)
+
+        def counted(*arguments: Any, made: Any = made, name: str = name) -> Any:
+            tries.append(name)
+            return made(*arguments)
+
+        monkeypatch.setattr(code, name, counted)
+    monkeypatch.setattr(code, "MOST_OPERATIONS", 50)
+    mechanism = _egg() if case == "an element" else srm.load("flyball_governor")
+    use = policy._use_of(mechanism)
+    started = time.monotonic()
+    while not use.settled and time.monotonic() - started < PATIENCE:
+        _no_code(mechanism, 1)
+    _no_code(mechanism, 20)
+    expected = ["structure_of"] if case == "an element" else ["structure_of", "source_of"]
+    assert tries == expected
+
+
+def test_without_a_place_for_the_cache_code_is_compiled_for_the_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("SRM_MBS_CACHE", str(tmp_path / "file"))
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    _runs(srm.load("four_bar"))
+    assert not list(temporary.iterdir())
+
+
+def test_runs_go_on_with_the_kernel_where_the_disk_is_full(
+    monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    mechanism = _used()
+    _no_code(mechanism, 5)
+    assert policy._failed
+    assert not list(folder.iterdir())
+
+
+def test_a_damaged_library_is_not_run_but_compiled_again(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    srm.compile(srm.load("four_bar"))
+    (library,) = folder.glob("*.so")
+    whole = library.read_bytes()
+    library.write_bytes(whole[:-7])
+    monkeypatch.setattr(code, "_libraries", type(code._libraries)())
+    mechanism = srm.load("four_bar")
+    assert finished(mechanism, 0.1).settings.backend == "kernel"
+    _runs(mechanism)
+    assert len(library.read_bytes()) == len(whole)
+
+
+def test_threads_run_a_mechanism_while_it_is_compiled() -> None:
+    mechanism = _used()
+    expected = {by: finished(mechanism, 2.0, backend=by).q for by in ("kernel",)}
+    taken: set[str] = set()
+
+    def runs(_: int) -> list[Any]:
+        out = []
+        started = time.monotonic()
+        while time.monotonic() - started < PATIENCE:
+            out.append(finished(mechanism, 2.0))
+            if out[-1].settings.backend == "generated":
+                break
+        return out
+
+    with ThreadPoolExecutor(3) as pool:
+        solutions = [one for found in pool.map(runs, range(3)) for one in found]
+    expected["generated"] = finished(mechanism, 2.0, backend="generated").q
+    for one in solutions:
+        taken.add(one.settings.backend)
+        assert np.array_equal(one.q, expected[one.settings.backend])
+    assert taken == {"kernel", "generated"}
+
+
+def test_a_fork_leaves_the_compilation_to_its_parent(
+    program: Callable[[str], Path], folder: Path
+) -> None:
+    calls = program("sleep 0.5; exec CC")
+    mechanism = _used()
+    assert finished(mechanism, 2.0).settings.backend == "kernel"
+    assert policy._job is not None
+    child = os.fork()
+    if child == 0:  # its runs are the kernel's, and its end is not that of the compiler
+        status = 1
+        try:
+            by = finished(mechanism, 0.5).settings.backend
+            status = 0 if by == "kernel" and policy._job is None else 2
+            code_cache.end_background()
+            policy._end()
+        finally:
+            os._exit(status)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    _runs(mechanism)
+    assert calls.read_text().count("\n") == 1
+    # And the fork of a process that has code runs it.
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            status = 0 if finished(mechanism, 0.5).settings.backend == "generated" else 2
+        finally:
+            os._exit(status)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+RUNS = """
+import os, sys, time
+from pathlib import Path
+import srm_mbs as srm
+from srm_mbs.integration.generated import policy
+
+policy.START_SECONDS, policy.STATEMENT_SECONDS, policy.PAIR_SECONDS = 1e-3, 0.0, 0.0
+mechanism = srm.load("four_bar")
+started = time.monotonic()
+while policy._job is None and srm.simulate(mechanism, 2.0).settings.backend == "kernel":
+    assert time.monotonic() - started < 60.0
+"""
+BESIDE = f"""{RUNS}
+calls = Path(os.environ["CC"]).with_name("calls")
+while str(policy._job.compilation._processes[0].pid) not in calls.read_text().split():
+    assert time.monotonic() - started < 60.0
+    time.sleep(0.01)
+"""
+"""A program in which a compiler of :func:`program` has begun beside the runs."""
+
+
+def test_a_program_that_ends_ends_the_compiler(
+    program: Callable[[str], Path], folder: Path
+) -> None:
+    calls = program("sleep 100 & sleep 100")
+    script = f"{BESIDE}\nprint(time.time())"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    took = time.time() - float(done.stdout)
+    assert done.stderr == ""
+    assert took < 5.0
+    assert not _alive(int(calls.read_text()))
+    assert not list(folder.iterdir())
+
+
+@pytest.mark.stress
+def test_what_is_compiled_when_a_program_ends_is_kept(
+    program: Callable[[str], Path], folder: Path
+) -> None:
+    program("exec CC")
+    script = f"{BESIDE}\npolicy._job.compilation._processes[0].wait()"
+    subprocess.run([sys.executable, "-c", script], check=True)
+    assert [path.suffix for path in sorted(folder.iterdir())] == [".sha256", ".so"]
+    assert finished(srm.load("four_bar"), 0.1).settings.backend == "generated"
+
+
+@pytest.mark.stress
+def test_a_worker_that_ends_ends_its_compiler(
+    program: Callable[[str], Path], folder: Path, tmp_path: Path
+) -> None:
+    """Workers of multiprocessing do not run what is registered with ``atexit``."""
+    calls = program("sleep 100")
+    indented = BESIDE.replace("\n", "\n    ")
+    script = tmp_path / "workers.py"
+    script.write_text(
+        f"import multiprocessing\ndef work():\n    {indented}\nif __name__ == '__main__':\n"
+        "    for way in ('fork', 'spawn'):\n"
+        "        worker = multiprocessing.get_context(way).Process(target=work)\n"
+        "        worker.start(); worker.join(); assert worker.exitcode == 0\n"
+    )
+    subprocess.run([sys.executable, str(script)], check=True)
+    started = [int(line) for line in calls.read_text().split()]
+    assert len(started) == 2
+    assert not any(map(_alive, started))
+    assert not list(folder.iterdir())
+
+
+@pytest.mark.stress
+def test_of_many_processes_one_compiles(program: Callable[[str], Path], folder: Path) -> None:
+    calls = program("sleep 1; exec CC")
+    script = RUNS.replace("policy._job is None and ", "")
+    programs = [subprocess.Popen([sys.executable, "-c", script]) for _ in range(3)]
+    assert [one.wait() for one in programs] == [0, 0, 0]
+    assert calls.read_text().count("\n") == 1
+    assert [path.suffix for path in sorted(folder.iterdir())] == [".sha256", ".so"]
+
+
+@pytest.mark.stress
+def test_a_process_that_needs_the_code_waits_for_the_one_that_compiles_it(
+    program: Callable[[str], Path], folder: Path
+) -> None:
+    calls = program("sleep 1; exec CC")
+    script = "import srm_mbs as srm; print(srm.compile(srm.load('four_bar')))"
+    programs = [
+        subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    said = [one.communicate()[0] for one in programs]
+    assert sorted("found" in text for text in said) == [False, True]
+    assert calls.read_text().count("\n") == 1
+
+
+@pytest.mark.stress
+def test_a_killed_process_leaves_the_code_to_others(
+    program: Callable[[str], Path], folder: Path
+) -> None:
+    calls = program("sleep 100")
+    killed = subprocess.Popen([sys.executable, "-c", f"{BESIDE}\ntime.sleep(100)"])
+    _wait_for(lambda: calls.read_text())
+    killed.kill()
+    killed.wait()
+    os.killpg(int(calls.read_text()), signal.SIGKILL)
+    program("exec CC")
+    _runs(srm.load("four_bar"))
+    (left,) = folder.glob(f"{code_cache._WORK}*")
+    long_ago = time.time() - 2.0 * code_cache._ABANDONED
+    os.utime(left, (long_ago, long_ago))
+    srm.compile(srm.load("slider_crank"))
+    assert not left.exists()
+
+
+def test_compiling_ahead_ends_what_compiles_the_same_beside_the_program(
+    program: Callable[[str], Path], folder: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "slow").write_text("")
+    calls = program(f"if [ -e {tmp_path / 'slow'} ]; then sleep 100; fi; exec CC")
+    mechanism = _used()
+    finished(mechanism, 2.0)
+    _wait_for(lambda: calls.read_text())
+    (tmp_path / "slow").unlink()
+    beside = int(calls.read_text())
+    assert srm.compile(mechanism).seconds > 0.0
+    assert not _alive(beside)
+    assert finished(mechanism, 2.0).settings.backend == "generated"
+    # The compiler has not failed: others follow.
+    _runs(_used("slider_crank"))
+
+
+def test_code_that_another_process_compiled_meanwhile_is_taken(
+    program: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = program("exec CC")
+    mechanism = srm.load("four_bar")
+    assert finished(mechanism, 0.1).settings.backend == "kernel"
+    srm.compile(srm.load("four_bar"))
+    compiled = calls.read_text()  # by a slow kernel, the first run has begun to compile it, too
+    assert compiled
+    monkeypatch.setattr(code, "_libraries", type(code._libraries)())
+    monkeypatch.setattr(code, "_arrivals", 0)
+    _runs(mechanism)
+    assert calls.read_text() == compiled
+
+
+@pytest.mark.parametrize("name", ["spatial_four_bar", "jansen_walker"])
+def test_code_that_is_compiled_beside_the_program_computes_what_that_compiled_ahead_does(
+    name: str, program: Callable[[str], Path], folder: Path
+) -> None:
+    """Bit by bit: as one unit, and as two, with the algebra of few coordinates and of many."""
+    calls = program("exec CC")
+    *_, beside = _runs(_used(name), t_end=0.2)
+    assert calls.read_text().count("\n") == 1
+    code_cache.clear()
+    code._libraries.clear()
+    mechanism = srm.load(name)
+    assert srm.compile(mechanism).seconds > 0.0
+    assert calls.read_text().count("\n") == 4  # two units, and what links them
+    ahead = finished(mechanism, 0.2, backend="generated")
+    assert np.array_equal(ahead.q, beside.q)
+    assert np.array_equal(ahead.v, beside.v)
+
+
+@pytest.mark.stress
+def test_the_source_is_the_same_in_every_process() -> None:
+    script = (
+        "import hashlib; import srm_mbs as srm; m = srm.load('squeezing_mechanism');"
+        "from srm_mbs.integration.generated.code import *;"
+        "s, _ = structure_of_mechanism(m);"
+        "print(*(hashlib.sha256(x.encode()).hexdigest() for x in (generated_source(m),"
+        " identity_of(s))))"
+    )
+    said = {
+        subprocess.run(
+            [sys.executable, "-c", script],
+            env=os.environ | {"PYTHONHASHSEED": seed},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for seed in ("1", "2")
+    }
+    assert len(said) == 1
+
+
+def test_the_identity_covers_every_module_that_writes_the_source(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    folder = Path(code.__file__).parent
+    writers = {path.stem for path in folder.glob("[a-z]*.py")} - set(code._NO_GENERATOR)
+    for name in writers:
+        text = (folder / f"{name}.py").read_text()
+        for other in code._NO_GENERATOR:
+            assert f"generated.{other} import" not in text
+    usual = code._generator.__wrapped__()
+    read = code.pkgutil.get_data
+    for changed in writers:
+
+        def get(package: str, name: str, changed: str = changed) -> bytes:
+            return (read(package, name) or b"") + (b" " if name == f"{changed}.py" else b"")
+
+        monkeypatch.setattr(code.pkgutil, "get_data", get)
+        assert code._generator.__wrapped__() != usual, changed
+    monkeypatch.setattr(code.pkgutil, "get_data", read)
+    assert code._generator.__wrapped__() == usual

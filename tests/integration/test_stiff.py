@@ -14,12 +14,10 @@ from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
-from srm_mbs.analysis.time_constants import time_constants
 from srm_mbs.dynamics.multibody import make_system
 from srm_mbs.integration.methods.base import ErrorNorm, Linearisation
 from srm_mbs.integration.methods.linear_split_step import LinearSplitStep, linearised
 from srm_mbs.integration.methods.tableaus import get_tableau
-from tests.support.bundled import load
 from tests.support.commands import run as command
 from tests.support.convergence import fitted_order, observed_order, turning
 from tests.support.mechanisms import floating_ring
@@ -260,26 +258,6 @@ def test_friction_on_several_joints_runs_alike_on_both_backends() -> None:
     start = np.concatenate([chain.q0, chain.v0])
     expected = solve_ivp(field, (0.0, 0.5), start, method="Radau", rtol=1e-9, atol=1e-11)
     np.testing.assert_allclose(runs[0].q[-1], expected.y[: model.nq, -1], atol=1e-5)
-
-
-@pytest.mark.parametrize("constants", [4.0, 9.0])
-def test_mild_stiffness_costs_no_more_than_twice_the_explicit_steps(constants: float) -> None:
-    """Steps of the delta robot that are limited to a few time constants of a damper: a stiff one,
-    with differences along 21 coordinates, takes the evaluations of three to four explicit ones."""
-    robot = load("delta_robot")
-    model = robot.model.copy()
-    model.damping = 50.0 * (np.arange(model.nv) == robot.joint("arm_1").idx_v)
-    damped = replace(robot, model=model, forces=())
-    (damper,) = time_constants(damped)
-    limit = constants * damper.seconds
-
-    def run(tableau: str) -> srm.Solution:
-        return srm.simulate(damped, 100.0 * limit, max_step=limit, tableau=tableau)
-
-    auto, explicit = run("auto"), run("dop853")
-    assert auto.settings.stiff
-    assert auto.stats.evaluations < 2.0 * explicit.stats.evaluations
-    np.testing.assert_allclose(auto.q[-1], explicit.q[-1], atol=1e-6)
 
 
 def test_undamped_stiff_springs_stay_with_explicit_steps() -> None:

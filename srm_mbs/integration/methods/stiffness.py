@@ -24,9 +24,9 @@ STIFF_STEPS = 15
 """Steps that show that a problem is stiff, or that it no longer is."""
 OTHER_STEPS = 6
 """Steps in a row that show no stiffness, after which those before count no more."""
-NOT_STIFF = 12.0
-"""h |lambda| of a linearly implicit step up to which explicit ones cost less: two of dop853 are
-stable over it, and it takes the time of 1.6 (few coordinates) to 7 (closures between links)."""
+NOT_STIFF = 2.0
+"""h |lambda| of a linearly implicit step up to which an explicit one would do: it is stable for
+three times as long a step."""
 UNRESOLVED = 2.0
 """Change of a rate over a step, in friction speeds, from which its stages miss the change of the
 friction."""

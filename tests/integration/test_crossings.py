@@ -174,16 +174,18 @@ def test_the_kernel_tells_turns_beside_singular_configurations_as_the_reference(
         np.testing.assert_allclose(own.values, other.values, rtol=1e-6)
 
 
-@needs_kernel
 @pytest.mark.parametrize("reach", [-1e-3, -1e-4])
 def test_turns_of_a_drive_that_avoid_a_configuration_are_searched(reach: float) -> None:
     solution = srm.simulate(beside_change_points("driven", reach), 6.0, rtol=1e-7)
-    scheme, steps = solution.scheme, solution.steps
+    scheme, steps, analysis = solution.scheme, solution.steps, solution.system.singularities
     dips = crossings_module.recorded_dips(scheme, steps)
+    assert analysis is not None
     assert dips is not None
-    told = solution._dense.turns(scheme, dips, 1e-9)  # type: ignore[attr-defined]
+    monitor = ConstraintMonitor(analysis, solution._dense, solution.settings.singular_tolerance)
+    told = kernel_steps.recorded_turns(monitor, scheme, steps, dips)
     np.testing.assert_array_equal(told.samples, dips.samples)
-    assert (told.turns, told.at_turns) == ([], [])
+    assert not told.turns
+    assert not told.at_turns
 
 
 @pytest.mark.parametrize("family", ["driven", "driven_with_pendulum"])

@@ -127,6 +127,11 @@ SMALLEST_REST = 1e-9
 
 
 @lru_cache(maxsize=16)
+def exact_up_to(singular_tolerance: float) -> float:
+    """Residual (row units) up to which a critical configuration counts as singular."""
+    return max(singular_tolerance, ROUNDED_RESIDUAL)
+
+
 def gauss_nodes(count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Nodes (k,) on [0, 1], weights (k,), and the integrals (k, k) of the basis up to the nodes."""
     x, w = np.polynomial.legendre.leggauss(count)
@@ -737,7 +742,7 @@ def layer_motion(
         critical = critical_configuration(
             geometry, analysis.rank, place, SEARCH, (), ROUNDED_RESIDUAL
         )
-        if critical is None or not abs(critical.residual) > max(tolerance, ROUNDED_RESIDUAL):
+        if critical is None or not abs(critical.residual) > tolerance:
             return None
         curve = CurveThroughSaddle(critical, place, False)
         geometry.closure(place)
@@ -814,7 +819,7 @@ class CriticalPassages:
         self, system: BranchSystem, scheme: ButcherTableau, norm: ErrorNorm, tolerance: float
     ) -> None:
         self._system, self._scheme, self._norm = system, scheme, norm
-        self._tolerance = tolerance
+        self._tolerance = exact_up_to(tolerance)
         self._known = self._quiet = False
         self._sigma = self._examine_below = np.inf
         self._rest: PlaceOnCurve | None = None
@@ -911,7 +916,7 @@ class CriticalPassages:
         return _step_beside(self._avoided, begin, end)
 
     def _avoids(self, critical: CriticalConfiguration) -> bool:
-        return abs(critical.residual) > max(self._tolerance, ROUNDED_RESIDUAL)
+        return abs(critical.residual) > self._tolerance
 
     def accepted(self, result: StepResult) -> None:
         """A step was accepted: where sigma rises, the next passage is another one."""
@@ -972,7 +977,7 @@ class CriticalPassages:
             if self._one_freedom and not geometry.drives and critical.geometry is geometry:
                 self._found.append(critical)
             return []
-        avoided, steps_pass = abs(residual) > self._tolerance, False
+        avoided, steps_pass = self._avoids(critical), False
         steps: list[tuple[StepResult, float]] = []
         disturbs = abs(residual) > DISTURBING * self._norm.rtol
         if avoided or disturbs or end < zero + ahead:

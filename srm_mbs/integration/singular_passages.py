@@ -22,6 +22,7 @@ import math
 from bisect import bisect_left, insort
 from collections.abc import Callable, Collection, Generator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from itertools import pairwise
 from typing import TypeVar
 
@@ -49,7 +50,7 @@ from srm_mbs.dynamics.singularities.local_analysis import (
 )
 from srm_mbs.dynamics.system import SingularityAnalysis, System
 from srm_mbs.errors import time_text
-from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
+from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL, exact_up_to
 from srm_mbs.integration.dense_output import CRITICAL, STEP_PLACEMENTS, DenseOutput, StepData
 from srm_mbs.integration.methods.butcher import SAME_STAGE, ButcherTableau
 from srm_mbs.model.lazy import cached_property
@@ -201,7 +202,7 @@ class ConstraintMonitor:
         critical_of: Callable[[ConstraintMonitor, float], CriticalPlace | None] = critical_near,
     ) -> None:
         self._critical_of = critical_of
-        self.tolerance = max(tolerance, ROUNDED_RESIDUAL)
+        self.tolerance = exact_up_to(tolerance)
         self.geometry = analysis.geometry(analysis.q0)
         self.rank = analysis.rank
         self.analysis = analysis
@@ -1022,25 +1023,26 @@ def find_crossings(
     analysis = system.singularities
     if analysis is None or not steps.count:
         return ()
-    monitor = None
+
+    @cache
+    def made() -> ConstraintMonitor:
+        return ConstraintMonitor(analysis, *monitored(), critical_of)
+
     if analysis.sigma_reference >= SMALL_REFERENCE_PIVOT:
         recorded = dips_of(scheme, steps)
     else:
-        monitor = ConstraintMonitor(analysis, *monitored(), critical_of)
         t, _ = _recorded(scheme, steps)
-        values = monitor.smallest(t)
+        values = made().smallest(t)
         recorded = _dips(t, values / np.median(values), scheme.n_stages)
     if recorded is not None and recorded.turns is None:
-        monitor = monitor or ConstraintMonitor(analysis, *monitored(), critical_of)
-        recorded = turns_of(monitor, scheme, steps, recorded)
+        recorded = turns_of(made(), scheme, steps, recorded)
     resolved: list[int] = []
     if recorded or analysis.driven:
         t, sigma = _recorded(scheme, steps)
         resolved = _resolved_dips(sigma, recorded) if analysis.driven else []
     if not (recorded or steps.critical_ranges or resolved):
         return ()
-    monitor = monitor or ConstraintMonitor(analysis, *monitored(), critical_of)
-    searches = []
+    monitor, searches = made(), []
     if recorded:
         searches = [
             _crossings_at(monitor, steps, t, sigma, dip, top, slice(*free))

@@ -48,8 +48,8 @@ from srm_mbs.integration.control.step_size import (
     initial_step,
 )
 from srm_mbs.integration.critical_passages import (
-    ROUNDED_RESIDUAL,
     CriticalPassages,
+    exact_up_to,
     examined_passages,
     step_from_layer,
 )
@@ -441,7 +441,7 @@ def _usual_norms(mechanism: Mechanism) -> dict[tuple[float, float, float, Units]
 def error_norm(mechanism: Mechanism, options: RunOptions) -> ErrorNorm:
     """The error norm with the tolerances of checked ``options``."""
     known = _usual_norms(mechanism)
-    singular = max(options.singular_tolerance, ROUNDED_RESIDUAL)
+    singular = exact_up_to(options.singular_tolerance)
     key = options.rtol, options.negligible, singular, mechanism.structure.units
     if options.atol is None and key in known:
         return known[key]

@@ -38,7 +38,7 @@ public:
           stages_(static_cast<long>(dips.columns.size())),
           nv_(system.nv),
           nq_(system.nq),
-          columns_(static_cast<long>(rows.factors.size() / rows.supports.size())),
+          unknowns_(static_cast<long>(rows.factors.size() / rows.supports.size())),
           state_(nq_ + nv_),
           change_(nv_),
           G_(rows.factors.size()) {}
@@ -81,7 +81,7 @@ private:
         return true;
     }
 
-    // Whether all rates that matter change their sign in one of the steps, once.
+    // Whether all rates that the rows depend on change their sign in one of the steps, once.
     bool reverses(long first, long last, Reversal& out) {
         long found = -1;
         for (long step = first; step <= last; ++step) {
@@ -118,7 +118,7 @@ private:
 
     Rows rows_at(double t, const double* q) {
         rows_.write(all_rows_, t, q, G_);
-        return Rows(G_.data(), static_cast<long>(rows_.supports.size()), columns_);
+        return Rows(G_.data(), static_cast<long>(rows_.supports.size()), unknowns_);
     }
 
     // Whether the motion certainly did not touch the singular configuration.
@@ -172,7 +172,7 @@ private:
     const StepArrays& steps_;
     const long stages_;
     const int nv_, nq_;
-    const long columns_;
+    const long unknowns_;  // columns of the rows: time is one of them with drives
     std::vector<double> state_, change_, G_;
     Eigen::JacobiSVD<RowMatrix> svd_;
 };

@@ -16,7 +16,7 @@ from srm_mbs.dynamics.constraints.structure import SMALL_REFERENCE_PIVOT, struct
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem
 from srm_mbs.dynamics.singularities.critical import CriticalPlace
 from srm_mbs.integration import critical_passages, singular_passages
-from srm_mbs.integration.critical_passages import ROUNDED_RESIDUAL
+from srm_mbs.integration.critical_passages import exact_up_to
 from srm_mbs.integration.dense_output import DenseOutput, StepData
 from srm_mbs.integration.generated.code import code_of_record
 from srm_mbs.integration.kernel import marshalling
@@ -315,7 +315,7 @@ def dips_in_records(
     if found is None:
         return None if layers else ()
     dips = RecordedDips(*found)
-    others = dense.turns(scheme, dips, max(tolerance, ROUNDED_RESIDUAL))
+    others = dense.turns(scheme, dips, exact_up_to(tolerance))
     if others is None:
         return dips
     return others if others or layers else ()

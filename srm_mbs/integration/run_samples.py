@@ -18,10 +18,10 @@ MAX_SAMPLED_ENDS = 100
 """Most groups of successive steps of which one end each is sampled."""
 EVEN_TIMES = 501
 """Number of evenly spaced times between the ends, by dense output."""
-READ_STEPS = ((4, 60), (2, 120), (2, 120))
+READ_STEPS = ((4, 60, 20), (2, 120, 10), (2, 120, 10))
 """Where dense output takes further stages, it is read in some steps instead: those with the largest
 error estimates, the longest ones, and some at even distances.  Of each kind their fewest number,
-and the number of steps of which one is read; together a thirtieth."""
+the number of steps of which one is read, together a thirtieth, and their largest number."""
 READ_AT = np.array([0.2, 0.5, 0.8])
 """Fractions of these steps at which it is read."""
 
@@ -91,7 +91,9 @@ def times_between(scheme: ButcherTableau, steps: StepData) -> FloatArray:
     if not n or not len(scheme.dense.extra_c):
         return np.linspace(steps.times[0], steps.end, EVEN_TIMES)
     lengths = steps.times[1:] - steps.times[:-1]
-    by_error, by_length, even = (max(fewest, n // of) for fewest, of in READ_STEPS)
+    by_error, by_length, even = (
+        min(max(fewest, n // of), most) for fewest, of, most in READ_STEPS
+    )
     chosen = np.zeros(n, dtype=bool)
     chosen[steps.error_ratios.argsort(kind="stable")[-by_error:]] = True
     chosen[lengths.argsort(kind="stable")[-by_length:]] = True

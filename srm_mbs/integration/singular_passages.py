@@ -640,14 +640,14 @@ class RecordedDips:
     turns
         Turns beyond singular configurations, which are not among the minima; None before
         :func:`recorded_turns`.
-    at_turns
+    at_turns : (m, 3)
         As ``samples``, of those at turns, which are no longer among the minima.
     """
 
     samples: IndexArray
     tops: IndexArray
     turns: Sequence[Turn] | None = None
-    at_turns: Sequence[Sequence[int]] = ()
+    at_turns: IndexArray = field(default_factory=lambda: np.zeros((0, 3), dtype=int))
 
     def __bool__(self) -> bool:
         """Whether there is something to search."""
@@ -662,8 +662,9 @@ class RecordedDips:
 
     def at_no_turn(self, others: IndexArray, turns: Sequence[Turn]) -> RecordedDips:
         """The minima ``others`` (k,), and the ``turns`` found among the rest."""
-        at_turns = np.delete(self.samples, others, axis=0).tolist()
-        return RecordedDips(self.samples[others], self.tops[others], turns, at_turns)
+        told = np.ones(len(self.tops), dtype=bool)
+        told[others] = False
+        return RecordedDips(self.samples[others], self.tops[others], turns, self.samples[told])
 
 
 def recorded_dips(scheme: ButcherTableau, steps: StepData) -> RecordedDips | None:
@@ -932,7 +933,7 @@ def _resolved_dips(sigma: FloatArray, dips: RecordedDips | None) -> list[int]:
     ``dips`` at turns."""
     inner = sigma[1:-1]
     lowest = (inner <= sigma[:-2]) & (inner < sigma[2:]) & (inner < AVOIDED_SIGMA)
-    for first, _, last in () if dips is None else dips.at_turns:
+    for first, _, last in [] if dips is None else dips.at_turns.tolist():
         lowest[first : last - 1] = False
     return (np.flatnonzero(lowest) + 1).tolist()
 

@@ -39,17 +39,16 @@ void add_ends(const WeightedEnd& a, const WeightedEnd& b, const double* start, i
 }  // namespace
 
 void DenseOutput::between_ends(System& system, const double* t, long k, const double* allowed,
-                               double* out) {
-    EndNodes ends;
-    EndRates rates;
-    std::vector<double> of_coordinates(nx_);
-    system.coordinate_errors(allowed, of_coordinates.data());
+                               EndReadings& known, double* out) {
+    EndNodes& ends = known.nodes;
+    known.allowed.resize(nx_);
+    system.coordinate_errors(allowed, known.allowed.data());
     for (long i = 0; i < k; ++i, out += nx_) {
         const long step = step_at(t[i]);
         const double theta = (t[i] - steps_.times[step]) /
                              (steps_.times[step + 1] - steps_.times[step]);
         if (ends.step != step) take_ends(step, ends);
-        if (!near_ends(system, theta, of_coordinates.data(), rates, ends, out))
+        if (!near_ends(system, theta, known.allowed.data(), known.rates, ends, out))
             states(system, t + i, 1, out);
     }
 }

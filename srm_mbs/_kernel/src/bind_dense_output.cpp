@@ -201,7 +201,8 @@ struct PyDense {
         const std::size_t k = t.size();
         const double* within = vector_of(allowed, 2 * system.nv, "allowed");
         std::vector<double> out(k * nx);
-        dense.between_ends(system, t.data(), static_cast<long>(k), within, out.data());
+        EndReadings known;
+        dense.between_ends(system, t.data(), static_cast<long>(k), within, known, out.data());
         return owned_array(std::move(out), {k, nx});
     }
 

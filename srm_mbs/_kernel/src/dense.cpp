@@ -18,7 +18,7 @@ void Extension::check() const {
 
 void DenseConstants::check() const {
     expect_size("nodes", nodes.size(), 3);
-    expect_within("nodes", nodes, 2, DenseOutput::most_nodes);
+    expect_within("nodes", nodes, 2, most_nodes);
     if (!std::is_sorted(nodes.begin(), nodes.end()))
         throw std::invalid_argument("nodes do not ascend");
 }

@@ -72,6 +72,33 @@ struct SchemeDense {
     SRM_FIELDS(SRM_SCHEME_DENSE)
 };
 
+constexpr int most_nodes = 16;  // of a polynomial of the dense output
+
+// Rates of the coordinates at the ends of steps (steps + 1, nx), as far as they are known, in
+// the smooth interval that ends at `last`.
+struct EndRates {
+    long last = -1;
+    std::vector<char> known;
+    std::unique_ptr<double[]> rates;  // written where they are known
+};
+// Ends around a step in order of their distance, 0 if there are not enough; of the first `count`
+// of them, in use, the states and the rates of their coordinates, and of Hermite's polynomial
+// through these but the furthest the products of distances of each from the others, whose
+// inverses are the weights of Lagrange's basis, and its slope there.
+struct EndNodes {
+    long step = -1;
+    int all = 0, count = 0;
+    long nodes[most_nodes];
+    const double *states[most_nodes], *rates[most_nodes];
+    double points[most_nodes], products[most_nodes], slopes[most_nodes];
+};
+// What DenseOutput::between_ends keeps between its calls.
+struct EndReadings {
+    EndNodes nodes;
+    EndRates rates;
+    std::vector<double> allowed;  // (nx,), of the coordinates
+};
+
 class DenseOutput {
 public:
     // schemes: that of the run and, where it has one, that for stiff problems.
@@ -81,8 +108,9 @@ public:
     // std::out_of_range for times outside the run.
     void states(System& system, const double* t, long k, double* out);
     // The same by polynomials through ends of steps, without an evaluation, where two of them agree
-    // within `allowed` (n,).
-    void between_ends(System& system, const double* t, long k, const double* allowed, double* out);
+    // within `allowed` (n,).  `known`: of readings before.
+    void between_ends(System& system, const double* t, long k, const double* allowed,
+                      EndReadings& known, double* out);
 
     const StepArrays& steps() const { return steps_; }
     // Numbers of sigma in each step.
@@ -92,27 +120,7 @@ public:
     // Whether a step takes further stages to be read.
     bool takes_stages() const { return schemes_[0].extension.extra_stages() > 0; }
 
-    static constexpr int most_nodes = 16;  // of a polynomial
-
 private:
-    // Rates of the coordinates at the ends of steps (steps + 1, nx), as far as they are known, in
-    // the smooth interval that ends at `last`.
-    struct EndRates {
-        long last = -1;
-        std::vector<char> known;
-        std::unique_ptr<double[]> rates;  // written where they are known
-    };
-    // Ends around a step in order of their distance, 0 if there are not enough; of the first `count`
-    // of them, in use, the states and the rates of their coordinates, and of Hermite's polynomial
-    // through these but the furthest the products of distances of each from the others, whose
-    // inverses are the weights of Lagrange's basis, and its slope there.
-    struct EndNodes {
-        long step = -1;
-        int all = 0, count = 0;
-        long nodes[most_nodes];
-        const double *states[most_nodes], *rates[most_nodes];
-        double points[most_nodes], products[most_nodes], slopes[most_nodes];
-    };
     long step_at(double t) const;
     const double* coordinate_rate(const System& system, long node, long last,
                                   EndRates& rates) const;

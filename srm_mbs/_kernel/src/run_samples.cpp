@@ -56,7 +56,8 @@ std::vector<double> times_between(const StepArrays& steps, const SampleRules& ru
         return out;
     }
     const auto count = [&](int kind) {
-        return std::max<long>(rules.fewest[kind], n / rules.one_of[kind]);
+        const long part = std::max<long>(rules.fewest[kind], n / rules.one_of[kind]);
+        return std::min<long>(part, rules.most[kind]);
     };
     std::vector<char> chosen(n, 0);
     std::vector<double> lengths(n);
@@ -80,9 +81,9 @@ std::vector<double> times_between(const StepArrays& steps, const SampleRules& ru
 void SampleRules::check() const {
     expect_within("most_ends", most_ends, 1, std::numeric_limits<int>::max());
     expect_within("even_times", even_times, 2, std::numeric_limits<int>::max());
-    for (const auto* each : {&fewest, &one_of}) {
-        expect_size("fewest or one_of", each->size(), 3);
-        expect_within("fewest or one_of", *each, 1, std::numeric_limits<int>::max());
+    for (const auto* each : {&fewest, &one_of, &most}) {
+        expect_size("fewest, one_of or most", each->size(), 3);
+        expect_within("fewest, one_of or most", *each, 1, std::numeric_limits<int>::max());
     }
 }
 

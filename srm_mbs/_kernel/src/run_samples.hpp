@@ -12,7 +12,8 @@ namespace srm {
     field(int, most_ends)         /* groups of steps of which one end each is sampled */ \
     field(int, even_times)        /* times between, where dense output takes no stage */ \
     field(std::vector<int>, fewest) /* steps to read in else, by error, by length and */ \
-    field(std::vector<int>, one_of) /* at even distances: their number and its part */   \
+    field(std::vector<int>, one_of) /* at even distances: their number, its part, and */ \
+    field(std::vector<int>, most)   /* the largest number */                             \
     field(std::vector<double>, read_at) /* fractions of these steps */
 
 // Where a run is sampled.

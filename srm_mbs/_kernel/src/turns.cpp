@@ -14,10 +14,11 @@ namespace {
 using RowMatrix = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
 using Rows = Eigen::Map<const RowMatrix>;
 
-// The step in which all rates change their sign, and when (s) they vanish.
+// The step in which all rates change their sign, about when (s) they vanish, and the time over their
+// change.
 struct Reversal {
     long step;
-    double time;
+    double time, slope;
 };
 
 class TurnFinder {
@@ -72,10 +73,13 @@ private:
         if (to + 1 < dips.size() && dips[to + 1][1] <= (last + 1) * stages_) return false;
         Reversal reversal;
         Turn turn;
-        if (!reverses(first, last, reversal) ||
-            !certain(first, last, reversal, recorded.tops[from], turn))
-            return false;
-        if (system_.driven() && turn.values[0] > 0.0 && avoids(reversal.time)) return false;
+        if (!reverses(first, last, reversal)) return false;
+        const long top = recorded.tops[from];
+        if (!stays_short(first, last, reversal, sigma_at(dips[from][1]), top, turn)) {
+            allowed_.clear();
+            if (!certain(first, last, reversal, top, turn)) return false;
+        }
+        if (system_.driven() && turn.values[0] > 0.0 && avoids(turn.times[1])) return false;
         for (std::size_t i = from; i <= to; ++i) out.found[i] = 1;
         if (turn.values[0] < 0.0) out.beyond.push_back(turn);
         return true;
@@ -103,17 +107,53 @@ private:
         }
         const double resting = search_.resting * size;
         if (!(size * both - before * before - after * after < resting * resting)) return false;
-        const double start = steps_.times[found], end = steps_.times[found + 1];
-        double t = start - before / size * (end - start);
+        const double start = steps_.times[found], length = steps_.times[found + 1] - start;
+        out = {found, start - before / size * length, length / size};
+        return true;
+    }
+
+    // When (s) the rates vanish; the state there is read.
+    double turning_time(const Reversal& reversal) {
+        const double start = steps_.times[reversal.step], end = steps_.times[reversal.step + 1];
+        double t = reversal.time;
         for (int i = 0; i < search_.newton_steps; ++i) {
-            dense_.states(system_, &t, 1, state_.data());
+            read(t);
             double along = 0.0;
             for (const int k : search_.columns)
                 along += state_[nq_ + k] / search_.unit[k] * change_[k];
-            t = std::clamp(t - along / size * (end - start), start, end);
+            t = std::clamp(t - along * reversal.slope, start, end);
         }
-        out = {found, t};
-        return true;
+        read(t);
+        return t;
+    }
+
+    // Whether the turn certainly stays short of the singular configuration by polynomials through
+    // ends of steps, which take no evaluation.  sigma: next to it.
+    bool stays_short(long first, long last, const Reversal& reversal, double sigma, long top,
+                     Turn& turn) {
+        const double error = search_.reading_part * sigma;
+        if (!(error > search_.least_reading)) return false;
+        const double length = steps_.times[reversal.step + 1] - steps_.times[reversal.step];
+        allowed_.resize(2 * nv_);
+        for (int k = 0; k < nv_; ++k) {
+            allowed_[k] = error * search_.unit[k];
+            allowed_[nv_ + k] = allowed_[k] / length;
+        }
+        return certain(first, last, reversal, top, turn) && turn.values[0] > 0.0 &&
+               turn.values[1] > search_.reading_margin * error;
+    }
+
+    void read(double t) {
+        if (allowed_.empty())
+            dense_.states(system_, &t, 1, state_.data());
+        else
+            dense_.between_ends(system_, &t, 1, allowed_.data(), ends_, state_.data());
+    }
+
+    double sigma_at(long sample) const {
+        if (!sample) return steps_.sigmas[0];
+        const long step = (sample - 1) / stages_, stage = (sample - 1) % stages_;
+        return steps_.sigmas[step * dense_.sigma_width() + dips_.columns[stage]];
     }
 
     Rows rows_at(double t, const double* q) {
@@ -123,10 +163,10 @@ private:
 
     // Whether the motion certainly did not touch the singular configuration.
     bool certain(long first, long last, const Reversal& reversal, long top, Turn& turn) {
-        turn.times = {steps_.times[first], reversal.time, steps_.times[last + 1]};
+        const double time = turning_time(reversal);
+        turn.times = {steps_.times[first], time, steps_.times[last + 1]};
         turn.top = top;
-        dense_.states(system_, &reversal.time, 1, state_.data());
-        svd_.compute(rows_at(reversal.time, state_.data()),
+        svd_.compute(rows_at(time, state_.data()),
                      Eigen::ComputeThinU | Eigen::ComputeThinV);
         const int k = search_.rank - 1;
         const Eigen::VectorXd& sizes = svd_.singularValues();
@@ -139,14 +179,13 @@ private:
         }
         if (!(turn.values[0] * turn.values[2] > 0.0)) return false;
         // The largest value of the window follows from the recorded sigmas, about.
-        const long width = dense_.sigma_width(), at = std::max(top - 1, 0L);
-        const long top_step = at / stages_, stage = at % stages_;
-        const double untouched =
-            search_.untouched * steps_.sigmas[top_step * width + dips_.columns[stage]];
+        const long width = dense_.sigma_width();
+        const double untouched = search_.untouched * sigma_at(top);
         if (value * steps_.sigmas[first * width] > untouched * std::abs(turn.values[0]) &&
             value * steps_.sigmas[(last + 1) * width - 1] > untouched * std::abs(turn.values[2]))
             return true;
-        const double start = steps_.times[top_step], length = steps_.times[top_step + 1] - start;
+        const long step = (top - 1) / stages_, stage = (top - 1) % stages_;
+        const double start = steps_.times[step], length = steps_.times[step + 1] - start;
         const double t = top > 0 ? start + dips_.abscissae[stage] * length : start;
         dense_.states(system_, &t, 1, state_.data());
         svd_.compute(rows_at(t, state_.data()), 0);
@@ -173,7 +212,9 @@ private:
     const long stages_;
     const int nv_, nq_;
     const long unknowns_;  // columns of the rows: time is one of them with drives
-    std::vector<double> state_, change_, G_;
+    // allowed_ (2 nv,): error of what is read; without any, it is read by the dense output.
+    std::vector<double> state_, change_, allowed_, G_;
+    EndReadings ends_;
     Eigen::JacobiSVD<RowMatrix> svd_;
 };
 

@@ -22,6 +22,9 @@ namespace srm {
     field(double, together)          /* the next singular value, over the smallest */        \
     field(double, touching)          /* the smallest, over the largest value of the window */ \
     field(double, untouched)         /* the same, over the largest sigma of the window */    \
+    field(double, reading_part)      /* error of reading the turn, over sigma next to it */  \
+    field(double, least_reading)     /* that error below which it is not tried */            \
+    field(double, reading_margin)    /* the smallest value over that error, if it is sure */ \
     field(double, time_unit)         /* (s), with drives */                                  \
     field(double, reach)             /* of the search for a critical configuration */
 

@@ -34,6 +34,14 @@ from srm_mbs.integration.singular_passages import (
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.mechanism import MechanismData, per_start
 
+READING_PART = 1e-3
+"""Error within which a turn is read between ends of steps, over sigma next to it."""
+LEAST_READING = 1e-7
+"""That error below which it is not: ends of steps are seldom so close to a polynomial."""
+READING_MARGIN = 100.0
+"""The smallest singular value at the turn, over that error, above which the turn certainly stays
+short of the singular configuration."""
+
 
 def dense_output(
     system: ClosedSystem | OpenSystem, scheme: ButcherTableau, steps: StepData, made_by: str
@@ -267,6 +275,9 @@ def _turn_search(mechanism: MechanismData) -> tuple[Any, Any] | None:
         together=singular_passages.VANISHING_TOGETHER,
         touching=singular_passages.TOUCHING_VALUE,
         untouched=singular_passages.UNTOUCHED_VALUE,
+        reading_part=READING_PART,
+        least_reading=LEAST_READING,
+        reading_margin=READING_MARGIN,
         time_unit=float(geometry.unit[-1]),
         reach=singular_passages.CROSSING_SEARCH,
     )

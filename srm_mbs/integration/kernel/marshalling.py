@@ -409,12 +409,13 @@ def dense_constants() -> Any:
 @lru_cache(maxsize=1)
 def sample_rules() -> Any:
     """``SampleRules`` of run_samples.hpp."""
-    fewest, one_of = zip(*run_samples.READ_STEPS)
+    fewest, one_of, most = zip(*run_samples.READ_STEPS)
     return _core.SampleRules(
         most_ends=run_samples.MAX_SAMPLED_ENDS,
         even_times=run_samples.EVEN_TIMES,
         fewest=fewest,
         one_of=one_of,
+        most=most,
         read_at=run_samples.READ_AT,
     )
 

@@ -91,9 +91,7 @@ def times_between(scheme: ButcherTableau, steps: StepData) -> FloatArray:
     if not n or not len(scheme.dense.extra_c):
         return np.linspace(steps.times[0], steps.end, EVEN_TIMES)
     lengths = steps.times[1:] - steps.times[:-1]
-    by_error, by_length, even = (
-        min(max(fewest, n // of), most) for fewest, of, most in READ_STEPS
-    )
+    by_error, by_length, even = (min(max(fewest, n // of), most) for fewest, of, most in READ_STEPS)
     chosen = np.zeros(n, dtype=bool)
     chosen[steps.error_ratios.argsort(kind="stable")[-by_error:]] = True
     chosen[lengths.argsort(kind="stable")[-by_length:]] = True

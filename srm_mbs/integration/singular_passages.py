@@ -101,6 +101,9 @@ NEXT_TO_SAMPLE = 0.2
 LEAST_SLOPE = 0.7
 """sigma over the time from a crossing, over that next to it, below which the motion may turn
 back."""
+LOW_SIGMA = 2.0
+"""sigma, over that of a minimum that steps resolve, up to which the minimum of the singular value
+is looked for."""
 SAMPLES_AROUND = 100
 """Samples on either side of a crossing at which that is looked for."""
 EVERY = 4
@@ -767,8 +770,8 @@ def recorded_turns(
         return dips.at_no_turn(every, ())
     columns = scheme.member(False).distinct
     stages, samples = len(columns), dips.samples
-    # A turn beyond may show as several minima, one next to the other.
-    starts = np.flatnonzero(np.append(True, samples[1:, 0] != samples[:-1, 2]))
+    # A turn beyond may show as several minima, less than a step apart.
+    starts = np.flatnonzero(np.append(True, samples[1:, 0] - samples[:-1, 2] >= stages))
     ends = np.append(starts[1:], len(every)) - 1
     several = ends > starts
     lowest, highest = np.append(starts[several], every), np.append(ends[several], every)
@@ -938,37 +941,55 @@ def _resolved_dips(sigma: FloatArray, dips: RecordedDips | None) -> list[int]:
     return (np.flatnonzero(lowest) + 1).tolist()
 
 
+def _where_low(sigma: FloatArray, k: int) -> tuple[int, int]:
+    """First and last sample around that of the minimum ``k`` of ``sigma`` (n,) up to which it stays
+    low: that of the singular value, which other inertias move less, lies between them."""
+    least, most = DIP_WIDTHS[-1], SAMPLES_AROUND
+    high = sigma > LOW_SIGMA * sigma[k]
+    before, after = high[max(k - most, 0) : k][::-1], high[k + 1 : k + 1 + most]
+    widths = (int(side.argmax()) + 1 if side.any() else len(side) for side in (before, after))
+    left, right = (max(width, least) for width in widths)
+    return max(k - left, 0), min(k + right, len(sigma) - 1)
+
+
 def _avoided_by_steps(
     monitor: ConstraintMonitor,
     steps: StepData,
     t: FloatArray,
+    sigma: FloatArray,
     dips: Sequence[int],
     listed: Collection[float],
 ) -> list[Crossing]:
-    """The critical configurations that the motion of a driven mechanism avoided at those of the
-    recorded ``dips``, samples at t (k,) s, next to which no passage is ``listed`` (s).
+    """The critical configurations that the motion of a driven mechanism avoided at the ``dips``,
+    samples of the recorded ``sigma`` (k,) at t (k,) s, next to which no passage is ``listed`` (s).
 
     Where a drive turns back, steps may resolve a layer that others follow along the curve.
     """
     found: list[Crossing] = []
     known = sorted(listed)
+    width = DIP_WIDTHS[-1]
+
+    def is_known(first: float, last: float) -> bool:
+        after = bisect_left(known, first)
+        return after < len(known) and known[after] <= last
+
     for k in dips:
-        first = float(t[max(k - DIP_WIDTHS[-1], 0)])
-        last = float(t[min(k + DIP_WIDTHS[-1], len(t) - 1)])
-        next_known = bisect_left(known, first)
-        is_known = next_known < len(known) and known[next_known] <= last
-        if is_known or _along_curve(steps, t[k]):
+        first, last = float(t[max(k - width, 0)]), float(t[min(k + width, len(t) - 1)])
+        if is_known(first, last) or _along_curve(steps, t[k]):
             continue
-        times = np.linspace(first, last, SAMPLES)
+        beside = 0.25 * (last - first)
+        low, high = _where_low(sigma, k)
+        times = np.linspace(t[low], t[high], SAMPLES)
         values = monitor.smallest(times)
-        lowest = int(values.argmin())
-        if not 0 < lowest < len(times) - 1:
+        minima = np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] < values[2:])) + 1
+        if not len(minima):
             continue
+        lowest = int(minima[np.abs(times[minima] - t[k]).argmin()])
         near = slice(lowest - 1, lowest + 2)
         time = monitor.minimum(times[near], values[near])
-        if not monitor.avoids(time):
+        if is_known(time - beside, time + beside) or not monitor.avoids(time):
             continue
-        found.append(crossing_at(monitor, steps, time, 0.25 * (last - first), "avoided"))
+        found.append(crossing_at(monitor, steps, time, beside, "avoided"))
         insort(known, time)
     return found
 
@@ -1060,7 +1081,7 @@ def find_crossings(
         if later - earlier < SAME_PASSAGE * found[later]._beside:
             del found[later]
     if resolved:
-        for crossing in _avoided_by_steps(monitor, steps, t, resolved, found):
+        for crossing in _avoided_by_steps(monitor, steps, t, sigma, resolved, found):
             found[crossing.time] = crossing
     return tuple(found[time] for time in sorted(found))
 
@@ -1169,6 +1190,9 @@ def _crossing_at(
     kind = "passed"
     if not certain and monitor.avoids(time):
         kind = "avoided"
+        if monitor.geometry.drives:  # a drive may turn back there
+            turned = yield from _minimum(times[near], values[near], power=1)
+            time, value = min((time, value), turned, key=lambda found: found[1])
     # A motion that reaches a singular configuration passes or touches it: both are listed.
     elif not value <= TOUCHING_VALUE * scale:
         cosine = _rank_loss_cosine(monitor, time, certain, before, after)

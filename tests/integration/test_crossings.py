@@ -174,7 +174,7 @@ def test_the_kernel_tells_turns_beside_singular_configurations_as_the_reference(
         np.testing.assert_allclose(own.values, other.values, rtol=1e-6)
 
 
-@pytest.mark.parametrize("reach", [-1e-3, -1e-4])
+@pytest.mark.parametrize("reach", [-1e-3, -3.7e-4, -1e-4])
 def test_turns_of_a_drive_that_avoid_a_configuration_are_searched(reach: float) -> None:
     solution = srm.simulate(beside_change_points("driven", reach), 6.0, rtol=1e-7)
     scheme, steps, analysis = solution.scheme, solution.steps, solution.system.singularities
@@ -197,6 +197,39 @@ def test_turns_of_a_drive_are_listed_where_the_run_followed_the_residual(
     mechanism = beside_change_points(family, -1e-5)
     solution = srm.simulate(mechanism, 12.0, rtol=1e-7, singular_tolerance=tolerance)
     assert [crossing.kind for crossing in solution.crossings] == ["avoided"] * listed
+
+
+@slowly_on_both
+@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
+@pytest.mark.parametrize("family", ["driven", "driven_with_pendulum"])
+@pytest.mark.parametrize("reach", [-1e-5, -1.5e-4, -3.7e-4, -1e-3, -1.65e-2, -4e-2])
+def test_every_turn_of_a_drive_before_a_change_point_is_listed(
+    family: str, reach: float, rtol: float, backend: str
+) -> None:
+    mechanism = beside_change_points(family, reach)
+    options: dict[str, Any] = {"rtol": rtol, "backend": backend, "singular_tolerance": 0.0}
+    crossings = srm.simulate(mechanism, 30.0, **options).crossings
+    assert [crossing.kind for crossing in crossings] == ["avoided"] * 5
+    turns = np.pi * np.array([1.0, 3.0, 5.0, 7.0, 9.0])
+    np.testing.assert_allclose([crossing.time for crossing in crossings], turns, atol=1e-4)
+
+
+@on_both
+@pytest.mark.parametrize("away", [1e-8, -1e-7, 1e-6, -1e-5])
+@pytest.mark.parametrize("family", ["driven", "driven_with_pendulum"])
+@pytest.mark.parametrize("reach", [1e-5, -1e-5, -1e-4, -3.2e-4])
+def test_the_critical_configuration_next_to_a_turn_of_a_drive_is_found_from_beside_it(
+    family: str, reach: float, away: float, backend: str
+) -> None:
+    solution = srm.simulate(beside_change_points(family, reach), 4.0, backend=backend)
+    compiled = {"kernel": kernel_steps.critical_near, "python": crossings_module.critical_near}
+    analysis = solution.system.singularities
+    assert analysis is not None
+    monitor = ConstraintMonitor(analysis, solution._dense, 0.0, compiled[backend])
+    there, beside = monitor.critical(PI), monitor.critical(PI + away)
+    assert there is not None
+    assert beside is not None
+    assert abs(beside.residual) == pytest.approx(abs(there.residual), rel=1e-3)
 
 
 @slowly_on_both

@@ -118,6 +118,7 @@ namespace srm {
     field(double, critical_frozen)         /* step up to which the Hessian is kept (units) */      \
     field(double, critical_converging)     /* fall of the equations up to which it is too */       \
     field(double, critical_ridge)          /* added to the Hessian's diagonal */                   \
+    field(double, critical_time_ridge)     /* the same for time */                                 \
     field(double, critical_reach)          /* of the search (units) */                             \
     field(double, critical_farthest)       /* distance (units) from which a motion waits */        \
     field(double, critical_passed)         /* distance that is a passage, over that of the start */ \

@@ -271,7 +271,8 @@ private:
             std::copy_n(&hessian_[i * n_], n_, &matrix[i * size]);
             // Configurations that are critical together, as those of a free base, stay where they
             // are.
-            matrix[i * size + i] += constants_.critical_ridge;
+            matrix[i * size + i] +=
+                i < closures_.nv ? constants_.critical_ridge : constants_.critical_time_ridge;
             for (int j = 0; j < rank_; ++j) matrix[i * size + n_ + j] = G_[j * n_ + i];
         }
         for (int i = 0; i < rank_; ++i) {

@@ -50,6 +50,9 @@ RIDGE = 1e-5
 """Added to the Hessian, and taken from its counterpart for u: configurations that are critical
 together, such as those of a free base, and combinations that are, such as those of loops that are
 singular at once, stay where they are."""
+TIME_RIDGE = 1e-8
+"""The same for time, of which the curvature is small where a drive turns back next to a singular
+configuration: it is in proportion to the part that the drive has in u."""
 LARGEST_DEVIATION = 0.5
 """Distance of a configuration from its hyperbola, over that from the critical configuration, from
 which it is not beside that one."""
@@ -174,18 +177,24 @@ def _equations(g: FloatArray, G: FloatArray, u: FloatArray, delta: float) -> Flo
     return np.concatenate([G.T @ u, g - delta * u])
 
 
+def _ridge(geometry: ClosureGeometry) -> FloatArray:
+    """The matrix (n, n) that is added to the Hessian."""
+    ridge = np.full(len(geometry.unit), RIDGE)
+    ridge[geometry.model.nv :] = TIME_RIDGE
+    return np.diag(ridge)
+
+
 def _newton_step(
     g: FloatArray, G: FloatArray, u: FloatArray, delta: float, H: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """The step of (q, u) that keeps the length of u."""
+    """The step of (q, u) that keeps the length of u; H with its ridge."""
     rank, n = G.shape
     size = n + rank
     matrix, value = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
     matrix[:n, :n], matrix[:n, n:-1] = H, G.T
     matrix[n:-1, :n] = G
     matrix[n:-1, -1], matrix[-1, n:-1] = -u, u
-    own = np.arange(size)
-    matrix[own, own] += np.where(own < n, RIDGE, -(delta + RIDGE))
+    matrix[n:-1, n:-1] -= (delta + RIDGE) * np.eye(rank)
     value[:-1] = _equations(g, G, u, delta)
     step = np.linalg.solve(matrix, -value)
     return step[:n], step[n:-1]
@@ -233,14 +242,14 @@ def critical_configuration(
     g, G = rows @ (g / size), rows @ (G / size[:, None])
     u = np.zeros(structural_rank)
     u[-1] = 1.0
-    delta = float(u @ g)
+    delta, ridge = float(u @ g), _ridge(geometry)
     weights = (u @ rows) / size
     for one in known:
         away = geometry.difference(q, geometry.in_turns_of(q, one.q))
         if not np.abs(away).max() < reach:
             continue
         H = one.searched * np.sign(weights @ one.weights)
-        first, _ = _newton_step(g, G, u, delta, H)
+        first, _ = _newton_step(g, G, u, delta, H + ridge)
         if np.linalg.norm(first - away) < APPROACH * np.linalg.norm(away):
             turned = one.in_turns_of(q)
             if turned is not None:
@@ -259,7 +268,7 @@ def critical_configuration(
             decided = error <= DECIDED and abs(found.residual) <= singular_to
             if decided or error <= CONVERGED:
                 return found
-        step, turn = _newton_step(g, G, u, delta, H)
+        step, turn = _newton_step(g, G, u, delta, H + ridge)
         moved = float(np.abs(step).max())
         if not moved < reach:
             return None
@@ -294,7 +303,7 @@ def first_step_length(
     span = right[structural_rank - 1 :]
     places = np.array([geometry.move(q, DIFFERENCE * along) for along in span])
     changes = (weights @ jacobians(places) - weights @ G) / DIFFERENCE
-    matrix, value = span @ changes.T + RIDGE * np.eye(len(span)), np.zeros(len(span))
+    matrix, value = span @ (changes.T + _ridge(geometry) @ span.T), np.zeros(len(span))
     value[0] = -values[structural_rank - 1]
     return float(np.abs(np.linalg.solve(matrix, value) @ span).max())
 

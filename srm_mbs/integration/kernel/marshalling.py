@@ -179,6 +179,7 @@ def constants() -> Any:
         critical_frozen=critical.FROZEN,
         critical_converging=critical.CONVERGING,
         critical_ridge=critical.RIDGE,
+        critical_time_ridge=critical.TIME_RIDGE,
         critical_reach=critical_passages.SEARCH,
         critical_farthest=critical_passages.FARTHEST,
         critical_passed=critical_passages.PASSED,

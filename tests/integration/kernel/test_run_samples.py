@@ -10,7 +10,7 @@ import pytest
 import srm_mbs as srm
 from srm_mbs.integration.dense_output import DenseOutput
 from srm_mbs.integration.kernel import backend as kernel
-from srm_mbs.integration.run_samples import MAX_SAMPLED_ENDS, READ_AT, run_samples
+from srm_mbs.integration.run_samples import MAX_SAMPLED_ENDS, READ_AT, READ_STEPS, run_samples
 from tests.support.bundled import load
 
 pytestmark = pytest.mark.skipif(kernel.core is None, reason=f"no kernel: {kernel.missing}")
@@ -67,3 +67,12 @@ def test_a_long_run_is_sampled_at_its_start_its_end_and_where_closures_were_corr
     fractions = (between - steps.times[place]) / np.diff(steps.times)[place]
     np.testing.assert_allclose(fractions.reshape(-1, 3), np.tile(READ_AT, (len(between) // 3, 1)))
     assert int(steps.error_ratios.argmax()) in place
+
+
+@pytest.mark.parametrize("backend", ["kernel", "python"])
+def test_of_a_long_run_a_bounded_number_of_steps_is_read(backend: Any) -> None:
+    run = srm.simulate(load("four_bar"), 3.0, max_step=0.0015, backend=backend)
+    samples = run.samples()
+    assert run.steps.count >= 2000
+    between = np.setdiff1d(samples.times, run.steps.times)
+    assert len(between) <= len(READ_AT) * sum(most for *_, most in READ_STEPS)

@@ -332,6 +332,7 @@ def _minimum(t: FloatArray, values: FloatArray, power: int = 2) -> Search[tuple[
     where branches touch.
     """
     times, heights = t.tolist(), (values**power).tolist()
+    lowest = sorted(zip(heights, times))
     shortest = SMALLEST_REFINEMENT * (times[2] - times[0])
     # A value that passes zero has a sign: the zero of that is found in fewer steps.
     least = LEAST_SIGNED * float(values[0] + values[2])
@@ -344,17 +345,17 @@ def _minimum(t: FloatArray, values: FloatArray, power: int = 2) -> Search[tuple[
                 break
             new = _signed_zero(times, [math.sqrt(height) for height in heights])
         else:
-            bend = (fc - fb) / (c - b) - (fb - fa) / (b - a)
-            if not bend > 0.0:
-                break
-            slope = (fb - fa) / (b - a)
-            new = 0.5 * (a + b) - 0.5 * slope * (c - a) / bend
+            # The lowest are closer than the sides of the bracket, if their parabola has a minimum.
+            new = _vertex(lowest)
+            if not a < new < c:
+                new = _vertex(list(zip(heights, times)))
         if not a < new < c or abs(new - b) <= shortest:
             if not signed:
                 break
             signed = False
             continue
         value = float((yield np.array([new]))[0]) ** power
+        lowest = sorted([*lowest, (value, new)])[:3]
         signed = signed and value < SIGNED_DECREASE**2 * fb
         left = new < b
         if value < fb:
@@ -364,6 +365,17 @@ def _minimum(t: FloatArray, values: FloatArray, power: int = 2) -> Search[tuple[
             times = [new, b, c] if left else [a, b, new]
             heights = [value, fb, fc] if left else [fa, fb, value]
     return times[1], float(heights[1] ** (1.0 / power))
+
+
+def _vertex(points: Sequence[tuple[float, float]]) -> float:
+    """Time of the minimum of the parabola through three ``points``, each a value and its time; NaN
+    if it has none."""
+    (fa, a), (fb, b), (fc, c) = sorted(points, key=lambda point: point[1])
+    if not a < b < c:
+        return math.nan
+    slope = (fb - fa) / (b - a)
+    bend = (fc - fb) / (c - b) - slope
+    return 0.5 * (a + b) - 0.5 * slope * (c - a) / bend if bend > 0.0 else math.nan
 
 
 def _signed_zero(t: Sequence[float], values: Sequence[float]) -> float:

@@ -782,8 +782,8 @@ def recorded_turns(
         return dips.at_no_turn(every, ())
     columns = scheme.member(False).distinct
     stages, samples = len(columns), dips.samples
-    # A turn beyond may show as several minima, less than a step apart.
-    starts = np.flatnonzero(np.append(True, samples[1:, 0] - samples[:-1, 2] >= stages))
+    # A turn beyond may show as several minima, less than two steps apart.
+    starts = np.flatnonzero(np.append(True, samples[1:, 0] - samples[:-1, 2] >= 2 * stages))
     ends = np.append(starts[1:], len(every)) - 1
     several = ends > starts
     lowest, highest = np.append(starts[several], every), np.append(ends[several], every)
@@ -923,6 +923,10 @@ def _crossings_along_curves(monitor: ConstraintMonitor, steps: StepData) -> list
         lowest = first + int(np.argmin(steps.sigmas[first:last, -1]))
         time = float(steps.times[lowest + 1])
         before, after = steps.times[lowest], steps.times[min(lowest + 2, steps.count)]
+        if monitor.geometry.drives:
+            # Where a drive turns back sigma is flat, and the ends of steps are far apart.
+            around = steps.times[max(lowest - 1, 0)], after
+            time = _closest(monitor, np.linspace(*around, SAMPLES))
         critical = monitor.critical(time)
         if critical is None:
             if monitor.is_regular(time, (before, after)):
@@ -932,10 +936,6 @@ def _crossings_along_curves(monitor: ConstraintMonitor, steps: StepData) -> list
             critical = monitor.critical(time)
         if critical is None:
             continue
-        if monitor.geometry.drives:
-            # Where a drive turns back sigma is flat, and the ends of steps are far apart.
-            around = steps.times[max(lowest - 1, 0)], after
-            time = _closest(monitor, np.linspace(*around, SAMPLES))
         beside = 0.25 * float(steps.times[last] - steps.times[first])
         kind = "avoided" if monitor.follows(critical) else "passed"
         if kind == "passed" or steps.sigmas[lowest, -1] < AVOIDED_SIGMA:
@@ -1213,7 +1213,9 @@ def _crossing_at(
         if cosine > TURNED_BACK_COSINE:
             time, value = yield from _minimum(times[near], values[near], power=1)
             if value > TOUCHING_VALUE * scale:
-                return None
+                if not monitor.avoids(time):
+                    return None
+                kind = "avoided"
     slope = float(max(sides[0] / (time - before), sides[1] / (after - time)))
     return crossing_at(monitor, steps, time, VELOCITY_VALUE * scale / slope, kind)
 

@@ -257,18 +257,36 @@ def test_a_turn_that_shows_as_two_minima_of_sigma_passes_twice(backend: str) -> 
     np.testing.assert_allclose(times, passed_twice(reach)[:2], atol=1e-5)
 
 
+@slowly_on_both
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("name", ["folded", "parallelogram"])
+@pytest.mark.parametrize("reach", [-1.4268e-2, -2.1917e-3, -3.2617e-6, 2e-6, 1e-3])
+def test_every_turn_of_a_driven_four_bar_is_listed(
+    name: str, reach: float, side: float, backend: str
+) -> None:
+    mechanism = turning.driven_four_bar(name, reach, side)
+    options: dict[str, Any] = {"backend": backend, "singular_tolerance": 0.0, "tableau": "dopr54"}
+    crossings = srm.simulate(mechanism, 30.0, **options).crossings
+    expected = ["passed"] * 10 if reach > 0.0 else ["avoided"] * 5
+    assert [crossing.kind for crossing in crossings] == expected
+
+
 @pytest.mark.stress
-@pytest.mark.parametrize("seed", range(100))
+@pytest.mark.parametrize("seed", range(150))
 def test_random_turns_of_a_drive_are_listed_as_often_as_they_pass(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    family = str(rng.choice(["driven", "driven_with_pendulum"]))
-    reach = float(rng.choice([-1.0, 1.0])) * 10.0 ** rng.uniform(-6.0, -1.2)
+    family = str(rng.choice(["driven", "driven_with_pendulum", "folded", "parallelogram"]))
+    reach = float(rng.choice([-1.0, 1.0])) * 10.0 ** rng.uniform(-5.9, -1.2)
     options: dict[str, Any] = {
         "rtol": 10.0 ** rng.uniform(-9.0, -4.0),
         "tableau": str(rng.choice(["dop853", "dopr54"])),
         "singular_tolerance": 0.0,
     }
-    crossings = srm.simulate(beside_change_points(family, reach), 30.0, **options).crossings
+    if family.startswith("driven"):
+        mechanism = beside_change_points(family, reach)
+    else:
+        mechanism = turning.driven_four_bar(family, reach, float(rng.choice([-1.0, 1.0])))
+    crossings = srm.simulate(mechanism, 30.0, **options).crossings
     expected = ["passed"] * 10 if reach > 0.0 else ["avoided"] * 5
     assert [crossing.kind for crossing in crossings] == expected
 

@@ -18,6 +18,7 @@ from scipy.integrate import solve_ivp
 import srm_mbs as srm
 from tests.support import reduced
 from tests.support.bundled import load
+from tests.support.change_point import CHANGE_POINTS, AlmostChangePoint
 from tests.support.mechanisms import along_x, rod
 
 G = 9.81
@@ -82,6 +83,20 @@ def driven(reach: float, rate: float) -> Motion:
         return np.outer(angle, ALIKE), np.outer(speed, ALIKE)
 
     return Motion(mechanism, 2.0 * np.pi / rate, exact)
+
+
+def driven_four_bar(name: str, reach: float, side: float) -> srm.Mechanism:
+    """A change-point four-bar (:data:`tests.support.change_point.CHANGE_POINTS`) whose crank is
+    driven, at 1 rad/s, from one ``side`` (1 or -1) of its change point up to ``reach`` and back."""
+    four_bar = AlmostChangePoint(*CHANGE_POINTS[name], 0.0)
+    there = np.pi * (four_bar.levels[0] != 0.0)
+    start = there + side * (reach - 2.0 * SWING)
+    mechanism = replace(four_bar, start=float(start % (2.0 * np.pi)), speed=1.0).mechanism()
+    law = srm.Sine(
+        side * SWING, phase=-TOP, offset=float(mechanism.q0[0]) + side * SWING, omega=1.0
+    )
+    drive = srm.Drive(law, "crank", absolute=True)
+    return replace(mechanism, drives=(drive,)).with_state(mechanism.q0, 0.0 * mechanism.v0)
 
 
 def driven_with_pendulum(reach: float, rate: float) -> Motion:

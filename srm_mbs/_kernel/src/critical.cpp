@@ -132,9 +132,12 @@ private:
                 found.u = u_;
             }
             if (error <= converged) break;
+            // The curvature by time follows from the part of a drive in u, which has none at first.
             const bool known = last_move_ <= constants_.critical_frozen &&
-                               (i == 0 || error < constants_.critical_converging * last);
+                               (i == 0 || error < constants_.critical_converging * last) &&
+                               (n_ == closures_.nv || moves_ > 1);
             if (!known && !differentiate()) return infinity;
+            ++moves_;
             last = error;
             fill_matrix(matrix);
             for (double& v : value) v = -v;
@@ -293,6 +296,7 @@ private:
     std::vector<double> g_, G_, u_, hessian_, x_, moved_;
     std::vector<double> ahead_, behind_, move_, there_;  // of differentiate()
     double last_move_ = infinity;
+    int moves_ = 0;
     std::vector<int> chosen_;
     double time_ = 0.0, delta_ = 0.0;
 };

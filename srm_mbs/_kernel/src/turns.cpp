@@ -50,8 +50,8 @@ public:
         Turns out{std::vector<char>(n), {}};
         for (std::size_t first = 0, next; first < n; first = next) {
             next = first + 1;
-            while (next < n && dips[next][0] - dips[next - 1][2] < stages_) ++next;
-            // A turn beyond may show as several dips, less than a step apart.
+            while (next < n && dips[next][0] - dips[next - 1][2] < 2 * stages_) ++next;
+            // A turn beyond may show as several dips, less than two steps apart.
             if (next > first + 1 && turns(recorded, first, next - 1, out)) continue;
             for (std::size_t i = first; i < next; ++i) turns(recorded, i, i, out);
         }

@@ -256,11 +256,13 @@ def critical_configuration(
                 return turned
     x, moved, best, last = q, np.inf, np.inf, np.inf
     found: CriticalConfiguration | None = None
-    for _ in range(ITERATIONS):
+    for i in range(ITERATIONS):
         error = float(np.abs(_equations(g, G, u, delta)).max())
         if not error < best and error < ACCEPTED:
             break
-        if moved > FROZEN or not error < CONVERGING * last:
+        # The curvature by time follows from the part of a drive in u, which has none at first.
+        early = bool(geometry.drives) and i < 2
+        if early or moved > FROZEN or not error < CONVERGING * last:
             H = _hessian(geometry, (u @ rows) / size, x, jacobians, G.T @ u)
         last = error
         if error < best:

@@ -954,8 +954,9 @@ def _resolved_dips(sigma: FloatArray, dips: RecordedDips | None) -> list[int]:
 
 
 def _where_low(sigma: FloatArray, k: int) -> tuple[int, int]:
-    """First and last sample around that of the minimum ``k`` of ``sigma`` (n,) up to which it stays
-    low: that of the singular value, which other inertias move less, lies between them."""
+    """First and last sample next to the minimum ``k`` of ``sigma`` (n,) up to which sigma stays low.
+
+    The minimum of the singular value lies between them: sigma depends on the inertias as well."""
     least, most = DIP_WIDTHS[-1], SAMPLES_AROUND
     high = sigma > LOW_SIGMA * sigma[k]
     before, after = high[max(k - most, 0) : k][::-1], high[k + 1 : k + 1 + most]

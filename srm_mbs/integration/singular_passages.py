@@ -954,7 +954,7 @@ def _resolved_dips(sigma: FloatArray, dips: RecordedDips | None) -> list[int]:
 
 
 def _where_low(sigma: FloatArray, k: int) -> tuple[int, int]:
-    """First and last sample next to the minimum ``k`` of ``sigma`` (n,) up to which sigma stays low.
+    """First and last sample next to the minimum ``k`` of ``sigma`` (n,) up to which it stays low.
 
     The minimum of the singular value lies between them: sigma depends on the inertias as well."""
     least, most = DIP_WIDTHS[-1], SAMPLES_AROUND

@@ -243,7 +243,8 @@ DEPENDENT = 1e-10
 DEPENDENT_SHARE = 0.01
 """Smallest factor in their relation, of a norm of 1, of those that a message names."""
 DIFFERENCE = 1e-6
-"""Step of the finite differences that check G and g_t, relative to max(1, |x|) and to the run."""
+"""Step of the finite differences that check G and g_t, relative to |x|, or to the smallest unit of
+the states, and to the run."""
 FINER = tuple(10.0**-k for k in range(9))
 """Lengths of that step, over the usual one, until the differences settle: x may be of a smaller
 size than its unit, and g vary faster than the run is long."""
@@ -559,12 +560,12 @@ class DaeSystem:
         CallbackError, EvaluationError
             If G cannot be evaluated.
         """
-        G = self.call("G", t, x)
+        G, unit = self.call("G", t, x), float(self._unit.min())
         for i in range(self.nx):
 
             def slope_over(finer: float, sides: tuple[int, int], i: int = i) -> FloatArray:
                 step = np.zeros(self.nx)
-                step[i] = finer * DIFFERENCE * max(1.0, abs(x[i]))
+                step[i] = finer * DIFFERENCE * max(unit, abs(x[i]))
                 ahead, behind = (self.call("g", t, x + side * step) for side in sides)
                 return np.asarray((ahead - behind) / ((sides[0] - sides[1]) * step[i]))
 

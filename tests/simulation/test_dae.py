@@ -580,7 +580,7 @@ def in_units(problem: srm.SemiExplicitDAE, size: float, span: float) -> srm.Semi
 
 
 @pytest.mark.parametrize("tableau", ["dopr54", "rodas5p"])
-@pytest.mark.parametrize(("size", "span"), [(1e-12, 1.0), (1e-5, 1e9), (1e12, 1e-9)])
+@pytest.mark.parametrize(("size", "span"), [(1e-30, 1.0), (1e-12, 1.0), (1e-5, 1e9), (1e12, 1e-9)])
 def test_the_unit_of_the_states_does_not_change_the_steps(
     size: float, span: float, tableau: str
 ) -> None:

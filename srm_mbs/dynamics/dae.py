@@ -382,6 +382,7 @@ class DaeSystem:
             "G": (self.ny, self.nx),
             "g_t": (self.ny,),
         }
+        self._accepted = {name: self._accepted_shapes(name) for name in self.shapes}
         self._nothing = np.zeros(self.ny)
         self.tangent_size = self.nx
         self.multiplier_part = slice(0, self.nx)
@@ -402,15 +403,15 @@ class DaeSystem:
 
     # --- the user's functions -----------------------------------------------------------------
 
-    def _may_have(self, shape: tuple[int, ...], name: str) -> bool:
-        """Whether ``name`` may return that ``shape``: the one of the contract, shorter where
-        ny = 1, and for a single value that of a number."""
-        full = self.shapes[name]
-        if max(full) == 1:
-            return shape in (full, (1,), ())
+    def _accepted_shapes(self, name: str) -> tuple[tuple[int, ...], ...]:
+        """Shapes that ``name`` may return: the one of the contract, shorter where ny = 1, and for a
+        single value that of a number."""
+        shape = self.shapes[name]
+        if max(shape) == 1:
+            return (shape, (1,), ())
         if self.ny > 1 or name == "f":
-            return shape == full
-        return shape in ((full, ()) if len(full) == 1 else (full, (self.nx,)))
+            return (shape,)
+        return (shape, ()) if len(shape) == 1 else (shape, (self.nx,))
 
     def call(self, name: str, t: float, x: FloatArray) -> FloatArray:
         """The value of the user's function ``name`` in the shape of the contract.
@@ -430,7 +431,7 @@ class DaeSystem:
             ) from error
         shape = self.shapes[name]
         if value.shape != shape:
-            if not self._may_have(value.shape, name):
+            if value.shape not in self._accepted[name]:
                 raise CallbackError(
                     f"{name} returned shape {value.shape} at t = {time_text(t)}; "
                     f"it must return {shape}"

@@ -270,7 +270,8 @@ void SplitStep::count_stiffness(IntegratorState& memory) {
         memory.saved_steps += share - 1.0;
         memory.stiff_steps = share < 1.0 ? memory.stiff_steps + 1 : 0;
         const int least = constants.stiff_steps;
-        if (memory.stiff_steps < std::max<double>(constants.dear_steps, least / cost)) return;
+        if (memory.stiff_steps < std::max(constants.dear_steps + std::log2(cost), least / cost))
+            return;
         memory.stiff = false;
         memory.stiff_steps = 0;
         const bool paid = memory.saved_steps > 0.0 || size < constants.not_stiff;

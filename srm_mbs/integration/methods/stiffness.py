@@ -24,8 +24,9 @@ STIFF_STEPS = 15
 """Steps that show that a problem is stiff, or that it no longer is."""
 OTHER_STEPS = 6
 """Steps in a row that show no stiffness, after which those before count no more."""
-DEAR_STEPS = 5
-"""Least of them that show that linearly implicit steps are too dear."""
+DEAR_STEPS = 2
+"""Least of them that show that linearly implicit steps are too dear, after those that they take to
+grow: they double at least, up to the length from which they pay."""
 NOT_STIFF = 2.0
 """h |lambda| of a linearly implicit step, over its cost, up to which an explicit one would do: it
 is stable for three times as long a step."""
@@ -136,7 +137,7 @@ def count_stiffness(
         share = stiffness / (NOT_STIFF * cost)
         memory.saved_steps += share - 1.0
         memory.stiff_steps = memory.stiff_steps + 1 if share < 1.0 else 0
-        if memory.stiff_steps >= max(DEAR_STEPS, STIFF_STEPS / cost):
+        if memory.stiff_steps >= max(DEAR_STEPS + math.log2(cost), STIFF_STEPS / cost):
             memory.stiff, memory.stiff_steps = False, 0
             paid = memory.saved_steps > 0.0 or stiffness < NOT_STIFF
             memory.needed_steps = STIFF_STEPS if paid else 2 * max(memory.needed_steps, STIFF_STEPS)

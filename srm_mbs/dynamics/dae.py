@@ -26,6 +26,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO, pivoted_qr, q_columns, whiten
@@ -33,17 +34,11 @@ from srm_mbs.dynamics.system import Zone
 from srm_mbs.errors import CallbackError, EvaluationError, InputError, safe_repr, time_text
 from srm_mbs.model.dae import SemiExplicitDAE
 from srm_mbs.model.lazy import cached_property
-from srm_mbs.model.numbers import real_array
+from srm_mbs.model.numbers import all_finite, real_array
 
-
-def _sizes(packed: FloatArray, pivots: FloatArray) -> FloatArray:
-    """Sizes (m,) of the directions of a matrix from its :func:`pivoted_qr`, falling: continuous
-    functions of the matrix, as the last of more than two ``pivots`` is not, which jumps where
-    others change places."""
-    m = len(pivots)
-    if m <= 2:
-        return pivots
-    return np.linalg.svd(np.triu(packed[:m]), compute_uv=False).astype(np.float64, copy=False)
+LARGEST_PIVOT = 1e150
+"""Largest norm of a row of G or a column of B, over the typical one: squares of larger ones
+overflow."""
 
 
 class ObliqueProjection:
@@ -62,7 +57,7 @@ class ObliqueProjection:
     ----------
     factorisations
         How many factorisations were done.
-    sizes : (3,)
+    sizes
         The smallest singular value of the scaled G^T, that of the scaled B, and the smallest
         cosine in C.  Of up to two rows, the last pivot takes the place of the singular value.
     sigma
@@ -79,7 +74,19 @@ class ObliqueProjection:
         reference: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> None:
         self.scale, self.rows, self.columns, self.reference = scale, rows, columns, reference
+        # Scales are powers of 2, by which nothing is rounded.
+        self._G_units, self._B_units = rows[:, None] / scale, scale[:, None] * columns
+        self._upper = np.tri(len(rows)).T
         self.factorisations = 0
+
+    def _sizes(self, packed: FloatArray, pivots: FloatArray) -> FloatArray:
+        """Sizes (ny,) of the directions of a matrix from its :func:`pivoted_qr`, falling:
+        continuous functions of the matrix, as the last of more than two ``pivots`` is not, which
+        jumps where others change places."""
+        if len(pivots) <= 2:
+            return pivots
+        R = packed[: len(pivots)] * self._upper
+        return lapack.dgesdd(R, compute_uv=0)[1]  # type: ignore[no-any-return]
 
     def factor(self, G: FloatArray, B: FloatArray, threshold: float | None) -> None:
         """Factorise G (ny, nx) and B (nx, ny), which are finite.
@@ -90,44 +97,55 @@ class ObliqueProjection:
         Raises
         ------
         EvaluationError
-            If G B is singular though neither G nor B loses rank.
+            If one of them is so large that its squares overflow, or if G B is singular though
+            neither G nor B loses rank.
         """
         self.factorisations += 1
-        packed, order, tau, pivots = pivoted_qr((G * self.scale / self.rows[:, None]).T)
-        packed_b, _, tau_b, pivots_b = pivoted_qr(B / self.scale[:, None] / self.columns)
-        g_sizes, b_sizes = _sizes(packed, pivots), _sizes(packed_b, pivots_b)
+        packed, order, tau, pivots = pivoted_qr((G / self._G_units).T)
+        packed_b, _, tau_b, pivots_b = pivoted_qr(B / self._B_units)
+        if not pivots[0] + pivots_b[0] < LARGEST_PIVOT:
+            raise EvaluationError("G or B grows beyond all numbers")
+        g_sizes, b_sizes = self._sizes(packed, pivots), self._sizes(packed_b, pivots_b)
         floor = PIVOT_ZERO if threshold is None else max(PIVOT_ZERO, threshold)
-        used = (g_sizes > floor * self.reference[0]) & (b_sizes > floor * self.reference[1])
-        rank = int(np.flatnonzero(used).max(initial=-1)) + 1
+        usual_g, usual_b, usual_cosine = self.reference
+        g_floor, b_floor = floor * usual_g, floor * usual_b
+        rank = len(G)
+        while rank and not (g_sizes[rank - 1] > g_floor and b_sizes[rank - 1] > b_floor):
+            rank -= 1
         self.rank, self.rank_deficient = rank, rank < len(G)
         self.order = order[:rank]
         self.R = packed[:rank, :rank]
         self.Q_G = q_columns(packed, tau, rank)
         self.Q_B = q_columns(packed_b, tau_b, rank)
-        angles = self.Q_G.T @ self.Q_B
+        angles = self.Q_G.T.dot(self.Q_B)
+        cosine = 1.0
         if rank == 1:
             cosine = abs(float(angles[0, 0]))
-        else:
-            left, cosines, right = np.linalg.svd(angles)
-            cosine = float(cosines[-1]) if rank else 1.0
+        elif rank:
+            left, cosines, right, _ = lapack.dgesdd(angles)
+            cosine = float(cosines[-1])
         if cosine < PIVOT_ZERO:
             raise EvaluationError(
                 "G B is singular though neither G nor B loses rank: x' does not stay bounded there"
             )
-        self.inverse: FloatArray = 1.0 / angles if rank == 1 else (right.T / cosines) @ left.T
-        self.sizes = np.array([g_sizes[-1], b_sizes[-1], cosine])
-        self.sigma = float((self.sizes / self.reference).min())
+        # Where no direction is in use, the matrices have no elements.
+        self.inverse: FloatArray = 1.0 / angles if rank < 2 else (right.T / cosines) @ left.T
+        g_size, b_size = float(g_sizes[-1]), float(b_sizes[-1])
+        self.sizes = (g_size, b_size, cosine)
+        self.sigma = min(g_size / usual_g, b_size / usual_b, cosine / usual_cosine)
 
     def lift(self, residual: FloatArray) -> FloatArray:
         """E r (nx,) for ``residual`` r (ny,): B (GB)^-1 r."""
         if self.rank == 0:
             return np.zeros(self.Q_B.shape[0])
-        scaled = (residual / self.rows)[self.order]
-        return self.scale * (self.Q_B @ (self.inverse @ whiten(self.R, scaled)))
+        scaled = (residual / self.rows).take(self.order)
+        lifted: FloatArray = self.Q_B.dot(self.inverse.dot(whiten(self.R, scaled)))
+        return self.scale * lifted
 
     def project(self, w: FloatArray) -> FloatArray:
         """P w (nx,)."""
-        return self.scale * (self.Q_B @ (self.inverse @ (self.Q_G.T @ (w / self.scale))))
+        projected: FloatArray = self.Q_B.dot(self.inverse.dot(self.Q_G.T.dot(w / self.scale)))
+        return self.scale * projected
 
 
 class DaeTerms:
@@ -168,7 +186,8 @@ class DaeTerms:
         return self._system.call("g", self.t, self.x)
 
     def _gamma(self) -> FloatArray:
-        return self.G @ self.f + self._system.time_derivative(self.t, self.x)
+        along_f: FloatArray = self.G.dot(self.f)
+        return along_f + self._system.time_derivative(self.t, self.x)
 
     def _completed(self, strong: FloatArray) -> FloatArray:
         """The strong part of yhat plus (1 - P_s) yhat_pred."""
@@ -224,7 +243,8 @@ DEPENDENT = 1e-10
 DEPENDENT_SHARE = 0.01
 """Smallest factor in their relation, of a norm of 1, of those that a message names."""
 DIFFERENCE = 1e-6
-"""Step of the finite differences that check G and g_t, relative to max(1, |x|) and to the run."""
+"""Step of the finite differences that check G and g_t, relative to |x|, or to the smallest unit of
+the states, and to the run."""
 FINER = tuple(10.0**-k for k in range(9))
 """Lengths of that step, over the usual one, until the differences settle: x may be of a smaller
 size than its unit, and g vary faster than the run is long."""
@@ -293,16 +313,15 @@ def _settled(
     return last
 
 
-def _units(x: FloatArray, one: FloatArray, greatest: float) -> FloatArray:
-    """Sizes (nx,) of the states: |x|, or what the tolerance is absolute to, ``one``, between 1 and
-    the largest state, now or since the start (``greatest``); 1 at the origin, where the states
-    tell nothing.
+def _units(sizes: FloatArray, largest: float, one: FloatArray, greatest: float) -> FloatArray:
+    """Sizes (nx,) of the states: |x|, given as ``sizes``, or what the tolerance is absolute to,
+    ``one``, between 1 and the ``largest`` state, now or since the start (``greatest``); 1 at the
+    origin, where the states tell nothing.
 
     A circle of a radius far below them counts as a point next to a singular one.
     """
-    largest = float(np.abs(x).max()) or 1.0
-    least = np.clip(one, min(1.0, largest), max(1.0, greatest))
-    return np.maximum(np.abs(x), least).astype(np.float64, copy=False)
+    least = np.minimum(np.maximum(one, min(1.0, largest or 1.0)), max(1.0, greatest))
+    return np.maximum(sizes, least)
 
 
 class DaeSystem:
@@ -352,8 +371,9 @@ class DaeSystem:
         # Powers of 2, by which nothing is rounded; 1 if atol is the same for all states.
         self._scale = np.exp2(np.round(np.log2(one / one.max())))
         self._one = one / self._scale
-        self._greatest = float(np.abs(x0 / self._scale).max())
-        self._unit = _units(x0 / self._scale, self._one, self._greatest)
+        sizes = np.abs(x0 / self._scale)
+        self._greatest = float(sizes.max())
+        self._unit = _units(sizes, self._greatest, self._one, self._greatest)
         self.ny = self._count_rows(t0, x0)
         self.shapes = {
             "f": (self.nx,),
@@ -362,6 +382,8 @@ class DaeSystem:
             "G": (self.ny, self.nx),
             "g_t": (self.ny,),
         }
+        self._accepted = {name: self._accepted_shapes(name) for name in self.shapes}
+        self._nothing = np.zeros(self.ny)
         self.tangent_size = self.nx
         self.multiplier_part = slice(0, self.nx)
         self.carries_yhat = T == "inverse"
@@ -381,7 +403,7 @@ class DaeSystem:
 
     # --- the user's functions -----------------------------------------------------------------
 
-    def _accepted(self, name: str) -> tuple[tuple[int, ...], ...]:
+    def _accepted_shapes(self, name: str) -> tuple[tuple[int, ...], ...]:
         """Shapes that ``name`` may return: the one of the contract, shorter where ny = 1, and for a
         single value that of a number."""
         shape = self.shapes[name]
@@ -407,20 +429,23 @@ class DaeSystem:
             raise CallbackError(
                 f"{name} raised {safe_repr(error)} at t = {time_text(t)}"
             ) from error
-        if value.shape not in self._accepted(name):
-            raise CallbackError(
-                f"{name} returned shape {value.shape} at t = {time_text(t)}; "
-                f"it must return {self.shapes[name]}"
-            )
-        if not np.isfinite(value).all():
+        shape = self.shapes[name]
+        if value.shape != shape:
+            if value.shape not in self._accepted[name]:
+                raise CallbackError(
+                    f"{name} returned shape {value.shape} at t = {time_text(t)}; "
+                    f"it must return {shape}"
+                )
+            value = value.reshape(shape)
+        if not all_finite(value):
             raise EvaluationError(
                 f"{name} returned values that are not finite at t = {time_text(t)}"
             )
-        return value.reshape(self.shapes[name])
+        return value
 
     def time_derivative(self, t: float, x: FloatArray) -> FloatArray:
         """g_t (ny,); 0 where none is given."""
-        return np.zeros(self.ny) if self.problem.g_t is None else self.call("g_t", t, x)
+        return self._nothing if self.problem.g_t is None else self.call("g_t", t, x)
 
     def _count_rows(self, t: float, x: FloatArray) -> int:
         try:
@@ -512,10 +537,11 @@ class DaeSystem:
 
         A solution that decays would come next to a singular point by its old size.
         """
-        scaled, old = state / self._scale, self._unit
-        self._greatest = max(self._greatest, float(np.abs(scaled).max()))
-        unit = _units(scaled, self._one, self._greatest)
-        if not scaled.any() or 1.0 / OTHER_SIZE < unit.max() / old.max() < OTHER_SIZE:
+        sizes, old = np.abs(state / self._scale), self._unit
+        largest = float(sizes.max())
+        self._greatest = max(self._greatest, largest)
+        unit = _units(sizes, largest, self._one, self._greatest)
+        if largest == 0.0 or 1.0 / OTHER_SIZE < unit.max() / old.max() < OTHER_SIZE:
             return False
         self._unit = unit
         try:
@@ -535,12 +561,12 @@ class DaeSystem:
         CallbackError, EvaluationError
             If G cannot be evaluated.
         """
-        G = self.call("G", t, x)
+        G, unit = self.call("G", t, x), float(self._unit.min())
         for i in range(self.nx):
 
             def slope_over(finer: float, sides: tuple[int, int], i: int = i) -> FloatArray:
                 step = np.zeros(self.nx)
-                step[i] = finer * DIFFERENCE * max(1.0, abs(x[i]))
+                step[i] = finer * DIFFERENCE * max(unit, abs(x[i]))
                 ahead, behind = (self.call("g", t, x + side * step) for side in sides)
                 return np.asarray((ahead - behind) / ((sides[0] - sides[1]) * step[i]))
 
@@ -603,9 +629,9 @@ class DaeSystem:
     def evaluate(self, t: float, state: FloatArray, zone: Zone | None = None) -> DaeTerms:
         """Factorise G and B at ``state``; see :class:`~srm_mbs.dynamics.system.System`."""
         self.evaluations += 1
-        if not np.isfinite(state).all():
+        if not all_finite(state):
             raise EvaluationError("the state is not finite")
-        f, B, G = (self.call(name, t, state) for name in ("f", "B", "G"))
+        f, B, G = self.call("f", t, state), self.call("B", t, state), self.call("G", t, state)
         self.projection.factor(G, B, None if zone is None else zone.threshold)
         predicted = None
         if self.projection.rank_deficient and zone is not None:

@@ -36,7 +36,7 @@ def finite_array(
         Whether it is a copy, which changes of ``values`` do not reach.
     """
     if type(values) is np.ndarray and values.dtype == float and shape in (None, values.shape):
-        return (values.copy() if new else values) if _all_finite(values) else None
+        return (values.copy() if new else values) if all_finite(values) else None
     try:
         if np.ma.is_masked(values):
             return None  # NumPy drops masks
@@ -49,7 +49,7 @@ def finite_array(
     )
     if not fits:
         return None
-    return array if _all_finite(array) else None
+    return array if all_finite(array) else None
 
 
 def real_array(values: Any, *, new: bool = True, booleans: bool = True) -> FloatArray:
@@ -83,7 +83,8 @@ def _is_text(value: Any) -> bool:
     return isinstance(value, str | bytes | bytearray)
 
 
-def _all_finite(array: FloatArray) -> bool:
+def all_finite(array: FloatArray) -> bool:
+    """Whether no element of ``array`` is infinite or NaN."""
     # Of a list where there are few, because a reduction of NumPy takes five times as long.
     if array.size <= FEW:
         return all(map(math.isfinite, array.ravel().tolist()))

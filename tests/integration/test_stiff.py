@@ -15,8 +15,9 @@ from scipy.integrate import solve_ivp
 import srm_mbs as srm
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.multibody import make_system
-from srm_mbs.integration.methods.base import ErrorNorm, Linearisation
+from srm_mbs.integration.methods.base import ErrorNorm, IntegratorState, Linearisation
 from srm_mbs.integration.methods.linear_split_step import LinearSplitStep, linearised
+from srm_mbs.integration.methods.stiffness import count_stiffness
 from srm_mbs.integration.methods.tableaus import get_tableau
 from tests.support.commands import run as command
 from tests.support.convergence import fitted_order, observed_order, turning
@@ -512,6 +513,53 @@ def test_kernel_and_reference_make_the_same_steps(name: str, tableau: str) -> No
     times = np.linspace(0.0, float(kernel.t[-1]), 41)
     for read, other in zip(kernel(times), reference(times)):
         np.testing.assert_allclose(read, other, rtol=0.0, atol=2e-4)
+
+
+@pytest.mark.parametrize("backend", SLOW_PYTHON)
+def test_implicit_steps_that_cost_more_than_they_save_are_left(backend: str) -> None:
+    """At that tolerance they are little longer than explicit ones at the bound of stability, and
+    one of them takes 6 times the evaluations: differences by 52 coordinates and rates."""
+    platform = srm.load("stewart_platform")
+    model = platform.model.copy()
+    model.damping = np.full(model.nv, 300.0)
+    options: dict[str, Any] = {"rtol": 1e-10, "backend": backend}
+    auto, explicit = (
+        srm.simulate(replace(platform, model=model), 3.0, tableau=tableau, **options)
+        for tableau in ("auto", "dop853")
+    )
+    assert auto.steps.stiff.any()
+    assert auto.stats.evaluations < 1.3 * explicit.stats.evaluations
+    np.testing.assert_allclose(end_of(auto), end_of(explicit), rtol=0.0, atol=1e-9)
+
+
+def test_a_try_of_implicit_steps_that_did_not_pay_doubles_what_the_next_one_needs() -> None:
+    scheme = get_tableau("auto")
+    memory = IntegratorState(np.zeros(2), np.inf, np.ones(2))
+
+    def explicit_steps() -> int:
+        count = 0
+        while not memory.stiff:
+            count_stiffness(memory, 7.0, 1.0, scheme)
+            count += 1
+        return count
+
+    def implicit_steps(*stiffness: float) -> int:
+        count = 0
+        while memory.stiff:
+            size = stiffness[min(count, len(stiffness) - 1)]
+            count_stiffness(memory, size, 8.0, scheme.member(True))
+            count += 1
+        return count
+
+    assert [(explicit_steps(), implicit_steps(7.0)) for _ in range(3)] == [
+        (15, 5),
+        (30, 5),
+        (60, 5),
+    ]
+    assert (explicit_steps(), implicit_steps(1000.0, 7.0)) == (120, 6)  # the first one paid
+    assert (explicit_steps(), implicit_steps(7.0)) == (15, 5)
+    assert (explicit_steps(), implicit_steps(1.0)) == (30, 5)  # not stiff for a while
+    assert explicit_steps() == 15
 
 
 # Singular configurations

@@ -580,7 +580,7 @@ def in_units(problem: srm.SemiExplicitDAE, size: float, span: float) -> srm.Semi
 
 
 @pytest.mark.parametrize("tableau", ["dopr54", "rodas5p"])
-@pytest.mark.parametrize(("size", "span"), [(1e-12, 1.0), (1e-5, 1e9), (1e12, 1e-9)])
+@pytest.mark.parametrize(("size", "span"), [(1e-30, 1.0), (1e-12, 1.0), (1e-5, 1e9), (1e12, 1e-9)])
 def test_the_unit_of_the_states_does_not_change_the_steps(
     size: float, span: float, tableau: str
 ) -> None:
@@ -918,3 +918,20 @@ def test_functions_of_one_state_may_return_numbers() -> None:
     assert run.success, run.message
     assert run.x[:, 0] == pytest.approx(np.sin(run.t), abs=1e-14)
     assert run.y[:, 0] == pytest.approx(-np.sin(run.t) - np.cos(run.t), abs=1e-13)
+
+
+@pytest.mark.parametrize("name", ["G", "B"])
+def test_values_whose_squares_overflow_stop_the_run_with_what_was_computed(name: str) -> None:
+    spheres = np.arange(1.0, 19.0).reshape(3, 6) % 5.0
+    normals: dict[str, Any] = {"G": lambda t, x: spheres * x, "B": lambda t, x: (spheres * x).T}
+    small = normals[name]
+    normals[name] = lambda t, x: small(t, x) * (1.0 if t < 0.5 else 1e300)
+    problem = srm.SemiExplicitDAE(
+        f=lambda t, x: -x[::-1],
+        g=lambda t, x: 0.5 * spheres @ (x * x - 1.0),
+        **normals,
+    )
+    run = srm.solve_dae(problem, (0.0, 1.0), np.ones(6), step=0.1, atol=np.geomspace(1e-8, 1e-5, 6))
+    assert run.status == "failed"
+    assert "G or B grows beyond all numbers" in run.message
+    assert run.t[-1] == pytest.approx(0.4)

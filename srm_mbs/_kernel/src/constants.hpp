@@ -52,6 +52,7 @@ namespace srm {
     /* Stiffness: methods/stiffness.py; differences: methods/linear_split_step.py. */               \
     field(int, stiff_steps)                /* that show that a problem is, or is not, stiff */     \
     field(int, other_steps)                /* in a row that end a count */                         \
+    field(int, dear_steps)                 /* that show that implicit steps are dear */            \
     field(double, not_stiff)               /* h |lambda| up to which explicit steps would do */    \
     field(int, power_iterations)                                                                   \
     field(double, unresolved)              /* change of a rate over a step (friction speeds) */    \

@@ -89,6 +89,7 @@ void LinearStages::linearise(double t, double h, const double* state,
         steps[j] = rounded_down(constants_.difference * std::max(unit_[j], state_scale[j]));
     std::fill(delta_.begin(), delta_.end(), 0.0);
     whole_ = solved || (on_branch_ && !system_.rank_deficient());
+    differences_ = 0;
     if (whole_) {
         if (lingers_) widen(state_scale, steps);
         if (!solved) system_.law_accelerations(W_.data());
@@ -149,6 +150,7 @@ bool LinearStages::rate_at(double t, const double* state, const Places& places,
 void LinearStages::by_differences(double t, const double* state, const std::vector<double>& steps,
                                   const Places& places) {
     const int nv = nv_, n = n_, m = count_;
+    differences_ = n;
     for (int j = 0; j < n; ++j) {
         const double step = delta_[j] = steps[j];
         system_.retract(state, delta_.data(), x_.data());

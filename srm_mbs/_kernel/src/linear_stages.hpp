@@ -57,6 +57,8 @@ public:
     const std::vector<double>& by_laws() const { return W_; }
     // Estimate of h |lambda|, lambda the largest eigenvalue of J.
     double stiffness(double h);
+    // Evaluations of a step, over those of its `stages`: methods/stiffness.py.
+    double cost(int stages) const { return 1.0 + static_cast<double>(differences_) / stages; }
 
 private:
     void linearise(double t, double h, const double* state,
@@ -80,6 +82,7 @@ private:
     const std::vector<double> unit_;
     const Constants& constants_;
     bool known_ = false, on_branch_ = false, lingers_ = false, whole_ = false;  // whole_: J is J_
+    int differences_ = 0;  // evaluations that regular rates were differentiated by
     double known_time_ = 0.0, k_ = 0.0;
     std::vector<double> known_state_, known_rate_, known_laws_;
     std::vector<double> rate_, by_time_, applied_, laws_, laws_there_;

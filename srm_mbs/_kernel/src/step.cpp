@@ -259,13 +259,24 @@ void SplitStep::count_stiffness(IntegratorState& memory) {
         } else if (memory.stiff_steps && ++memory.other_steps == constants.other_steps) {
             memory.stiff_steps = memory.other_steps = 0;
         }
+        if (memory.stiff_steps < std::max(memory.needed_steps, constants.stiff_steps)) return;
+        memory.stiff = true;
+        memory.stiff_steps = memory.other_steps = 0;
+        memory.saved_steps = 0.0;
     } else if (memory.stiff) {
-        const bool stiff = !(linear_->stiffness(h_) < constants.not_stiff) || chatters(memory);
-        memory.stiff_steps = stiff ? 0 : memory.stiff_steps + 1;
+        const double cost = linear_->cost(scheme.stages() - scheme.lead);
+        const double size = chatters(memory) ? infinity : linear_->stiffness(h_);
+        const double share = size / (constants.not_stiff * cost);
+        memory.saved_steps += share - 1.0;
+        memory.stiff_steps = share < 1.0 ? memory.stiff_steps + 1 : 0;
+        const int least = constants.stiff_steps;
+        if (memory.stiff_steps < std::max(constants.dear_steps + std::log2(cost), least / cost))
+            return;
+        memory.stiff = false;
+        memory.stiff_steps = 0;
+        const bool paid = memory.saved_steps > 0.0 || size < constants.not_stiff;
+        memory.needed_steps = paid ? least : 2 * std::max(memory.needed_steps, least);
     }
-    if (memory.stiff_steps < constants.stiff_steps) return;
-    memory.stiff = !memory.stiff;
-    memory.stiff_steps = memory.other_steps = 0;
 }
 
 // Error of h times the tangent rate at a stage that lies off the closures by `error` (n,).

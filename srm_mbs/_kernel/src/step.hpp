@@ -67,6 +67,8 @@ double initial_step(System& system, const ErrorNorm& norm, double t, const doubl
     field(int, stiff_steps)                 /* that speak for a change of that, */        \
     field(std::vector<double>, laws)        /* (m,), of forces, in linearly implicit steps */ \
     field(int, other_steps)                 /* and those after the last of them that do not */ \
+    field(int, needed_steps)                /* of them, after which a problem is stiff */ \
+    field(double, saved_steps)              /* by implicit steps, since it is */          \
     field(std::optional<MultiplierHistory>, history) /* none without closures */
 
 // The values that a method carries from one accepted step to the next.

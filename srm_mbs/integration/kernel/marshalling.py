@@ -113,6 +113,7 @@ def constants() -> Any:
         # Stiffness.
         stiff_steps=stiffness.STIFF_STEPS,
         other_steps=stiffness.OTHER_STEPS,
+        dear_steps=stiffness.DEAR_STEPS,
         not_stiff=stiffness.NOT_STIFF,
         power_iterations=stiffness.POWER_ITERATIONS,
         unresolved=stiffness.UNRESOLVED,
@@ -292,6 +293,8 @@ def state_struct(memory: IntegratorState) -> Any:
         stiff=memory.stiff,
         stiff_steps=memory.stiff_steps,
         other_steps=memory.other_steps,
+        needed_steps=memory.needed_steps,
+        saved_steps=memory.saved_steps,
         laws=_NO_NUMBERS if memory.laws is None else memory.laws,
         history=None if history is None else history_struct(history),
     )
@@ -311,6 +314,8 @@ def state_from(struct: Any) -> IntegratorState:
         struct.stiff,
         struct.stiff_steps,
         struct.other_steps,
+        struct.needed_steps,
+        struct.saved_steps,
         struct.laws if len(struct.laws) else None,
     )
 

@@ -88,6 +88,8 @@ class Linearisation:
     places
         Whether they are those of the rates on the branch next to a singular configuration, and
         whether nodes of it solve them.
+    differences
+        Evaluations that regular rates were differentiated by; 0 next to a singular configuration.
     """
 
     rate: FloatArray
@@ -98,6 +100,7 @@ class Linearisation:
     by_coordinates: FloatArray
     by_laws: FloatArray
     places: tuple[bool, bool]
+    differences: int
 
 
 @dataclass
@@ -126,6 +129,9 @@ class IntegratorState:
     stiff_steps, other_steps
         Steps that speak for a change of ``stiff``, and those after the last of them that do not
         (:mod:`srm_mbs.integration.methods.stiffness`).
+    needed_steps, saved_steps
+        Such steps after which the problem counts as stiff; what linearly implicit steps have saved
+        since it does, in steps.
     laws : (m,) or None
         Values of the laws of forces that linearly implicit steps carry; None after other steps.
     linearisation
@@ -142,6 +148,8 @@ class IntegratorState:
     stiff: bool = False
     stiff_steps: int = 0
     other_steps: int = 0
+    needed_steps: int = 0
+    saved_steps: float = 0.0
     laws: FloatArray | None = None
     linearisation: Linearisation | None = None
 
@@ -211,6 +219,8 @@ class StepResult:
     stiffness
         Estimate of h |lambda|, lambda the largest eigenvalue of the linearised equations; NaN if
         the step does not show it.
+    cost
+        Evaluations of a linearly implicit step and its linearisation, over those of its stages.
     """
 
     t: float
@@ -237,6 +247,7 @@ class StepResult:
     stiff: bool = False
     laws: FloatArray | None = None
     stiffness: float = np.nan
+    cost: float = 1.0
 
 
 class Method(Protocol):

@@ -169,7 +169,15 @@ def linearised(
         first, second = (rate_at(t + i * tau, state)[0] - rate for i in (1.0, 2.0))
         by_time = (4.0 * first - second) / (2.0 * tau)
     return Linearisation(
-        rate, J, by_time, applied, laws, by_coordinates, by_laws, (on_branch, nodes is not None)
+        rate,
+        J,
+        by_time,
+        applied,
+        laws,
+        by_coordinates,
+        by_laws,
+        (on_branch, nodes is not None),
+        n if known is None and not along else 0,
     )
 
 
@@ -189,9 +197,10 @@ class LinearStages:
         rate_of: Callable[[int, FloatArray, FloatArray], FloatArray],
         apply: Callable[[int], FloatArray],
         stiffness: float,
+        cost: float,
     ) -> None:
         self.rate, self._apply = rate_of, apply
-        self.stiffness = stiffness
+        self.stiffness, self.cost = stiffness, cost
         self.laws: FloatArray | None = None
 
     def begin(self, j: int) -> None:
@@ -273,7 +282,8 @@ class LinearSplitStep(SplitStep):
         unit = norm.one if norm.unit is None else norm.unit
         k = system.multiplier_part.start
         stiffness = largest_eigenvalue(known.J, h, unit, k)
-        return LinearStages(rate_of, apply, stiffness)
+        cost = 1.0 + known.differences / (end - lead)
+        return LinearStages(rate_of, apply, stiffness, cost)
 
 
 @dataclass(frozen=True)

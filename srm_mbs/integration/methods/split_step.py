@@ -56,11 +56,14 @@ class Stages(Protocol):
     ----------
     stiffness
         As far as it is known before the step.
+    cost
+        Evaluations of the step, over those of its stages.
     laws : (m,) or None
         Laws of forces at the stage begun last, if the scheme carries them.
     """
 
     stiffness: float
+    cost: float
     laws: FloatArray | None
 
     def begin(self, j: int) -> None:
@@ -234,6 +237,7 @@ class SplitStep:
         )
         if stages is not None:
             result.stiffness, result.laws = stages.stiffness, stages.laws
+            result.cost = stages.cost
         direct_from = BRANCH_SIGMA if nodes is not None and nodes.used else 0.0
         result.error_ratio = self._error_ratio(
             system, memory, norm, result, branch, deficient, direct_from
@@ -339,7 +343,7 @@ class SplitStep:
         memory.linearisation, memory.laws = None, result.laws
         if memory.history is not None:
             memory.history = history_after(memory.history, result)
-        count_stiffness(memory, result.stiffness, self.scheme)
+        count_stiffness(memory, result.stiffness, result.cost, self.scheme)
 
     def resume(
         self, system: System, t: float, state: FloatArray, memory: IntegratorState, norm: ErrorNorm
@@ -349,6 +353,7 @@ class SplitStep:
         fresh.sigma_slope, fresh.steps = memory.sigma_slope, memory.steps
         fresh.stiff, fresh.stiff_steps = memory.stiff, memory.stiff_steps
         fresh.other_steps = memory.other_steps
+        fresh.needed_steps, fresh.saved_steps = memory.needed_steps, memory.saved_steps
         return fresh
 
 

@@ -24,9 +24,12 @@ STIFF_STEPS = 15
 """Steps that show that a problem is stiff, or that it no longer is."""
 OTHER_STEPS = 6
 """Steps in a row that show no stiffness, after which those before count no more."""
+DEAR_STEPS = 2
+"""Least of them that show that linearly implicit steps are too dear, after those that they take to
+grow: they double at least, up to the length from which they pay."""
 NOT_STIFF = 2.0
-"""h |lambda| of a linearly implicit step up to which an explicit one would do: it is stable for
-three times as long a step."""
+"""h |lambda| of a linearly implicit step, over its cost, up to which an explicit one would do: it
+is stable for three times as long a step."""
 UNRESOLVED = 2.0
 """Change of a rate over a step, in friction speeds, from which its stages miss the change of the
 friction."""
@@ -107,8 +110,16 @@ def stopping_tolerance(norm: ErrorNorm) -> FloatArray:
     return np.maximum(norm.atol, norm.rtol * unit)
 
 
-def count_stiffness(memory: IntegratorState, stiffness: float, scheme: ButcherTableau) -> None:
-    """Take an accepted step of ``scheme`` with that ``stiffness`` into account."""
+def count_stiffness(
+    memory: IntegratorState, stiffness: float, cost: float, scheme: ButcherTableau
+) -> None:
+    """Take an accepted step of ``scheme`` with that ``stiffness`` and ``cost`` into account.
+
+    Linearly implicit steps end where they do not pay: where the problem is not stiff, or where
+    differences make them dear, and the tolerance does not allow steps as long as that.  An explicit
+    step is at the bound of its stability then, and would count as stiff at once, so that after each
+    try that did not pay twice as many such steps are needed for the next.
+    """
     if scheme.implicit is None:
         if memory.stiff or scheme.stable_to is None:
             return
@@ -119,11 +130,17 @@ def count_stiffness(memory: IntegratorState, stiffness: float, scheme: ButcherTa
             memory.other_steps += 1
             if memory.other_steps == OTHER_STEPS:
                 memory.stiff_steps = memory.other_steps = 0
+        if memory.stiff_steps >= max(memory.needed_steps, STIFF_STEPS):
+            memory.stiff, memory.stiff_steps, memory.other_steps = True, 0, 0
+            memory.saved_steps = 0.0
     elif memory.stiff:
-        memory.stiff_steps = memory.stiff_steps + 1 if stiffness < NOT_STIFF else 0
-    if memory.stiff_steps == STIFF_STEPS:
-        memory.stiff = not memory.stiff
-        memory.stiff_steps = memory.other_steps = 0
+        share = stiffness / (NOT_STIFF * cost)
+        memory.saved_steps += share - 1.0
+        memory.stiff_steps = memory.stiff_steps + 1 if share < 1.0 else 0
+        if memory.stiff_steps >= max(DEAR_STEPS + math.log2(cost), STIFF_STEPS / cost):
+            memory.stiff, memory.stiff_steps = False, 0
+            paid = memory.saved_steps > 0.0 or stiffness < NOT_STIFF
+            memory.needed_steps = STIFF_STEPS if paid else 2 * max(memory.needed_steps, STIFF_STEPS)
 
 
 def largest_eigenvalue(J: FloatArray, h: float, unit: FloatArray, k: int) -> float:

@@ -129,7 +129,7 @@ def test_an_integrator_state_comes_back_as_it_was(normals: np.ndarray | None) ->
     away = None if normals is None else np.arange(6.0).reshape(2, 3)
     history = MultiplierHistory(np.arange(4.0), values, 2.5, 1e-3, normals, away)
     given = IntegratorState(np.arange(6.0), 0.5, np.ones(6), history, 0.25, 7, True, True, 3, 2)
-    given.laws = np.arange(2.0)
+    given.needed_steps, given.saved_steps, given.laws = 30, -2.5, np.arange(2.0)
     found = marshalling.state_from(marshalling.state_struct(given))
     assert found.history is not None
     for name in ("times", "values", "normals", "away"):
@@ -138,6 +138,7 @@ def test_an_integrator_state_comes_back_as_it_was(normals: np.ndarray | None) ->
     assert (found.sigma, found.sigma_slope, found.steps) == (0.5, 0.25, 7)
     assert found.lingering
     assert (found.stiff, found.stiff_steps, found.other_steps) == (True, 3, 2)
+    assert (found.needed_steps, found.saved_steps) == (30, -2.5)
     assert found.laws is not None
     np.testing.assert_array_equal(found.laws, given.laws)
     np.testing.assert_array_equal(found.rate, given.rate)

@@ -324,7 +324,7 @@ def finished(result: Outcome, options: RunOptions) -> Outcome:
         With ``raise_on_failure``.
     """
     if options.raise_on_failure and not result.success:
-        raise SimulationError(result.message, result)
+        raise SimulationError(result.message, result) from result.error
     return result
 
 
@@ -1126,16 +1126,19 @@ def _limited_joints(mechanism: Mechanism) -> list[tuple[str, int, float, float]]
 
 
 def _limits_left(mechanism: Mechanism, least: FloatArray, largest: FloatArray) -> str:
-    """A sentence naming the one-degree joints that left their limits, which do not act; ``least``
-    and ``largest`` (nq,) are their coordinates."""
+    """A sentence naming the one-degree joints that started beyond their limits, which do not act,
+    and those that left them; ``least`` and ``largest`` (nq,) are their coordinates."""
     limited = _limited_joints(mechanism)
     if not limited:
         return ""
     lows, highs = least.tolist(), largest.tolist()
-    left = []
+    started, left = [], []
     for name, i, low, high in limited:
         # A run that a terminal event ends at a limit has not left it.
         slack = LIMIT_ROUNDING * max(1.0, -lows[i], highs[i])
         if max(low - lows[i], highs[i] - high) > slack:
-            left.append(name)
-    return f" Joint limits do not act; these joints left theirs: {', '.join(left)}." if left else ""
+            inside = low - slack <= mechanism.q0[i] <= high + slack
+            (left if inside else started).append(name)
+    clauses = [f"these joints left theirs: {', '.join(left)}"] if left else []
+    clauses += [f"these joints started beyond theirs: {', '.join(started)}"] if started else []
+    return f" Joint limits do not act; {'; '.join(clauses)}." if clauses else ""

@@ -938,7 +938,9 @@ class FinishedRun:
     @cached_property
     def nodes(self) -> tuple[FloatArray, FloatArray]:
         record = self._record
-        found = record.nodes() if isinstance(record, CompiledRecord) else None
+        # A stream took the steps out of the record.
+        whole = isinstance(record, CompiledRecord) and not self._streamed
+        found = cast(CompiledRecord, record).nodes() if whole else None
         if found is not None:
             return found
         return cast(DenseOutput, self.dense).nodes()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 

@@ -52,7 +52,7 @@ def _hinge_of_closure(
 ) -> FloatArray | None:
     """The axis (3,), a unit vector in the world, about which a closure of the type ``revolute``
     turns; None for other types, or where the two links do not agree about it."""
-    if loop.type != "revolute":
+    if loop.type != "revolute" or loop.axis is None:
         return None
     axis = np.array(loop.axis) / np.linalg.norm(loop.axis)
     a, b = (data.oMi[joint].rotation @ place.rotation @ axis for joint, place in anchors)

@@ -1134,7 +1134,8 @@ def _limits_left(mechanism: Mechanism, least: FloatArray, largest: FloatArray) -
     if not limited:
         return ""
     lows, highs = least.tolist(), largest.tolist()
-    started, left = [], []
+    started: list[str] = []
+    left: list[str] = []
     for name, i, low, high in limited:
         # A run that a terminal event ends at a limit has not left it.
         slack = LIMIT_ROUNDING * max(1.0, -lows[i], highs[i])

@@ -77,8 +77,8 @@ class Solution(AnimationMixin, SimulationResult):
         Raises
         ------
         InputError
-            If a point does not exist; for accelerations or reactions of a loaded run that had a
-            controller.
+            If a point does not exist; for reactions of a loaded run that had a controller, whose
+            points have no accelerations in the table.
         OSError
             If the file cannot be written.
         """

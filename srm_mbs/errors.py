@@ -48,6 +48,27 @@ def safe_repr(value: object) -> str:
     return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 3]}..."
 
 
+def raised(name: str, error: BaseException, when: str = "") -> str:
+    """The clause that the function ``name`` of the user raised ``error``, ``when`` ("at t = 1 s"),
+    with the last line of the function's own file that ran, if any did.
+
+    The file is named without its folder, because messages are saved with runs.
+    """
+    clause = f"{name} raised {safe_repr(error)}{when and f' {when}'}"
+    package = os.path.dirname(__file__) + os.sep
+    place, own = "", None
+    trace = error.__traceback__
+    while trace is not None:
+        code = trace.tb_frame.f_code
+        if own is None and not code.co_filename.startswith(package):
+            own = code.co_filename
+        if code.co_filename == own:
+            file = os.path.basename(code.co_filename)
+            place = f", in {code.co_name!r} ({file}, line {trace.tb_lineno})"
+        trace = trace.tb_next
+    return clause + place
+
+
 def printable(text: object, keep: str = "") -> str:
     """``text`` with characters that a terminal would act on shown as in Python's strings.
 

@@ -17,6 +17,7 @@ from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.scaling import is_angle
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR, smallest_singular_value
 from srm_mbs.errors import AssemblyError
+from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.coordinates import free_coordinates, joint_coordinates, position_of
 
 
@@ -25,25 +26,42 @@ def quoted(names: Iterable[str]) -> str:
     return ", ".join(repr(name) for name in names)
 
 
+def _rounded(value: float) -> float:
+    """A position (m, rad) for a message: what is below the rounding of closures is zero."""
+    return round(value, 12) + 0.0  # without the sign of a zero
+
+
 def _described(loop_residuals: Mapping[str, tuple[float | None, float | None]]) -> str:
     parts = []
     for name, (gap, angle) in loop_residuals.items():
-        values = [] if gap is None else [f"{gap:.3g} m"]
-        values += [] if angle is None else [f"{angle:.3g} rad"]
+        values = [] if gap is None else [f"{_rounded(gap):.3g} m"]
+        values += [] if angle is None else [f"{_rounded(angle):.3g} rad"]
         parts.append(f"{name}: {', '.join(values)}")
     return "; ".join(parts)
 
 
 PARALLEL_TOLERANCE = 1e-6
 """Sine of the angle between axes that are parallel."""
-CORRECT_AXIS = "Correct the axis of that joint, or the rotation of its place in the parent link"
+CORRECT_AXIS = "Correct that axis, or the rotation of the place of its joint or closure in the link"
 HINGES_OF_A_LOOP = 3
 """Least number of hinges from which the direction of most is known."""
 
 
+def _hinge_of_closure(
+    loop: LoopClosure, data: pin.Data, anchors: Iterable[tuple[int, pin.SE3]]
+) -> FloatArray | None:
+    """The axis (3,), a unit vector in the world, about which a closure of the type ``revolute``
+    turns; None for other types, or where the two links do not agree about it."""
+    if loop.type != "revolute" or loop.axis is None:
+        return None
+    axis = np.array(loop.axis) / np.linalg.norm(loop.axis)
+    a, b = (data.oMi[joint].rotation @ place.rotation @ axis for joint, place in anchors)
+    return b if np.linalg.norm(np.cross(a, b)) <= PARALLEL_TOLERANCE else None
+
+
 def inclined_axes(mechanism: Mechanism) -> dict[str, str]:
-    """Hinges whose axis, with all joints at zero, is inclined to those of the other hinges of a
-    loop, which are parallel: joint -> a clause that says so.
+    """Hinges, joints or the closure, whose axis, with all joints at zero, is inclined to those of
+    the other hinges of a loop, which are parallel: the element -> a clause that says so.
 
     Loops that may move with axes in any direction are left out: those with more joints than rows,
     or with joints of several degrees of freedom.
@@ -56,27 +74,32 @@ def inclined_axes(mechanism: Mechanism) -> dict[str, str]:
     for loop in mechanism.loops:
         if not loop.anchors:
             continue
-        a, b = (set(model.supports[joint].tolist()) for joint, _ in loop.resolve(model))
+        anchors = loop.resolve(model)
+        a, b = (set(model.supports[joint].tolist()) for joint, _ in anchors)
         joints = sorted(a ^ b)
         if len(joints) > loop.rows.count or any(model.joints[joint].nv > 1 for joint in joints):
             continue
-        turning = {joint: axes[model.joints[joint].idx_v] for joint in joints}
-        hinges = [joint for joint, axis in turning.items() if axis.any()]
+        turning = [(model.names[joint], axes[model.joints[joint].idx_v]) for joint in joints]
+        hinges = [(name, axis) for name, axis in turning if axis.any()]
+        closing = _hinge_of_closure(loop, data, anchors)
+        if closing is not None:
+            hinges.append((loop.name, closing))
         if len(hinges) < HINGES_OF_A_LOOP:
             continue
-        across = np.linalg.norm(
-            np.cross([[turning[i] for i in hinges]], [[turning[j]] for j in hinges]), axis=2
-        )
+        directions = np.array([axis for _, axis in hinges])
+        across = np.linalg.norm(np.cross(directions[None], directions[:, None]), axis=2)
         apart = across > PARALLEL_TOLERANCE
         odd = np.flatnonzero(apart.sum(axis=1) == len(hinges) - 1)
         if len(odd) != 1 or np.delete(np.delete(apart, odd, 0), odd, 1).any():
             continue
         others = [k for k in range(len(hinges)) if k != odd[0]]
         angle = np.degrees(np.arcsin(min(across[odd[0], others[0]], 1.0)))
-        name = model.names[hinges[odd[0]]]
-        found[name] = (
-            f"in the loop {loop.name!r} the axis of the joint {name!r} is inclined by "
-            f"{angle:.3g} degrees to those of {quoted(model.names[hinges[k]] for k in others)}, "
+        name, axis = hinges[odd[0]]
+        of_closure = axis is closing
+        element = f"{'loop' if of_closure else 'joint'} {name!r}"
+        found[element] = (
+            f"in the loop {loop.name!r} the axis of the {'closure' if of_closure else element} is "
+            f"inclined by {angle:.3g} degrees to those of {quoted(hinges[k][0] for k in others)}, "
             "which are parallel"
         )
     return found
@@ -100,7 +123,7 @@ def cannot_close(
             f"{'; '.join(inclined.values())}: the loops cannot be closed; {remaining}",
             residuals=loop_residuals,
             q=q,
-            element=f"joint {next(iter(inclined))!r}",
+            element=next(iter(inclined)),
             remedy=CORRECT_AXIS,
         )
     closings = {}
@@ -132,7 +155,7 @@ def cannot_close(
         remedy = f"Change or free one of {quoted(guilty)}: with it free, the loops close"
     if nearest:
         values = ", ".join(
-            f"{name} = {value:.9g} {'rad' if is_angle(mechanism.model, name) else 'm'}"
+            f"{name} = {_rounded(value):.9g} {'rad' if is_angle(mechanism.model, name) else 'm'}"
             for name, value in nearest.items()
         )
         remedy += f"; nearest values that close, one at a time: {values}"

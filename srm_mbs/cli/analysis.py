@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,7 +23,7 @@ from srm_mbs.cli.output import (
     table,
 )
 from srm_mbs.cli.playback import Trace, given_points
-from srm_mbs.errors import InputError
+from srm_mbs.errors import InputError, warn
 
 if TYPE_CHECKING:
     from srm_mbs.dynamics.mechanism import Mechanism
@@ -33,6 +33,20 @@ Hold = Annotated[
     list[str] | None,
     several("--hold", "JOINT[=VALUE]", "Keep a joint at VALUE (rad, m), or where it starts."),
 ]
+
+
+def value_wanted(problem: str, element: str) -> InputError:
+    """The error about a joint without a value in the option or argument ``element``."""
+    unit = "rad/s or m/s" if element == "--v" else "rad or m"
+    return InputError(problem, element=element, remedy=f"Write crank=1.5, in {unit}")
+
+
+def doubt_angles(mechanism: Mechanism, element: str, values: Mapping[str, Any]) -> None:
+    """Warn of positions, joint -> value, in ``element`` that may be in degrees."""
+    from srm_mbs.formats.plausibility import doubtful_angles
+
+    for doubt in doubtful_angles(mechanism, element, values, None):
+        warn(doubt)
 
 
 def joint_values(given: list[str] | None, element: str) -> tuple[dict[str, list[float]], list[str]]:
@@ -51,18 +65,17 @@ def joint_values(given: list[str] | None, element: str) -> tuple[dict[str, list[
         try:
             values[name] = [float(number) for number in numbers.split(",")]
         except ValueError:
-            raise InputError(
-                f"{text!r} is not a joint with a value", element=element, remedy="Write crank=1.5"
-            ) from None
+            raise value_wanted(f"{text!r} is not a joint with a value", element) from None
     return values, names
 
 
-def _held(given: list[str] | None) -> tuple[dict[str, float], list[str]]:
+def _held(mechanism: Mechanism, given: list[str] | None) -> tuple[dict[str, float], list[str]]:
     """Positions of the held joints that have one, and all their names."""
     values, names = joint_values(given, "--hold")
     if any(len(numbers) > 1 for numbers in values.values()):
         raise InputError("a held joint takes one value", element="--hold", remedy="Give one value")
     positions = {name: numbers[0] for name, numbers in values.items()}
+    doubt_angles(mechanism, "--hold", positions)
     return positions, [*positions, *names]
 
 
@@ -89,7 +102,7 @@ def modes(
     from srm_mbs.cli.tables import mode_rows
 
     mechanism = file.load()
-    positions, names = _held(hold)
+    positions, names = _held(mechanism, hold)
     found = srm_mbs.assembly_modes(
         mechanism,
         positions if hold else None,
@@ -120,7 +133,7 @@ def equilibrium(
     from srm_mbs.cli.tables import equilibrium_rows, position_rows
 
     mechanism = file.load()
-    positions, names = _held(hold)
+    positions, names = _held(mechanism, hold)
     found = srm_mbs.equilibrium(
         mechanism, positions, hold=names, search="nearest" if nearest else "stable"
     )
@@ -264,9 +277,8 @@ def drag(
     mechanism = file.load()
     targets, bare = joint_values(values, "JOINT=VALUE")
     if bare:
-        raise InputError(
-            f"joint {bare[0]!r} has no value", element="JOINT=VALUE", remedy="Write crank=1.5"
-        )
+        raise value_wanted(f"joint {bare[0]!r} has no value", "JOINT=VALUE")
+    doubt_angles(mechanism, "JOINT=VALUE", {n: p[0] for n, p in targets.items() if len(p) == 1})
     found = srm_mbs.follow(mechanism, targets)
     table(path_rows(found))
     echo("")

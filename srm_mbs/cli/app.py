@@ -317,10 +317,9 @@ def _started(mechanism: Mechanism, q: list[str] | None, v: list[str] | None) -> 
     for texts, element in ((q, "--q"), (v, "--v")):
         values, bare = analysis.joint_values(texts, element)
         if bare:
-            raise InputError(
-                f"joint {bare[0]!r} has no value", element=element, remedy="Write crank=1.5"
-            )
+            raise analysis.value_wanted(f"joint {bare[0]!r} has no value", element)
         given.append({name: n[0] if len(n) == 1 else n for name, n in values.items()} or None)
+    analysis.doubt_angles(mechanism, "--q", given[0] or {})
     start = srm_mbs.assemble(mechanism, *given)
     return mechanism.with_state(start.q, start.v)
 

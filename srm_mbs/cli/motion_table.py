@@ -131,8 +131,8 @@ def csv(
     solution = srm_mbs.load_solution(run)
     added = table_points(solution.mechanism, points)
     times = None if every is None else equal_times(every, *solution.span)
-    # Accelerations of points come before reactions, and runs with a controller have neither.
-    with naming(file=str(run), element="--point" if added else "--reactions"):
+    # Of a saved run with a controller there are none.
+    with naming(file=str(run), element="--reactions"):
         if path == STANDARD_OUTPUT:
             print_table(solution, times, added, reactions)
         else:

@@ -18,6 +18,7 @@ import typer
 from typer.models import ArgumentInfo, OptionInfo
 
 from srm_mbs.errors import (
+    AnalysisError,
     FailedRunWarning,
     InputError,
     SrmError,
@@ -90,7 +91,8 @@ class Lines(logging.Handler):
 
 
 def reported(command: Callable[Given, None]) -> Callable[Given, None]:
-    """Decorator of commands: warnings and expected errors become single lines, errors exit with 2.
+    """Decorator of commands: warnings and expected errors become single lines; errors exit with 2,
+    searches that find nothing with 1.
 
     Errors name an option as on the command line: ``--t-end``, not ``t_end``.
     """
@@ -109,7 +111,9 @@ def reported(command: Callable[Given, None]) -> Callable[Given, None]:
             if isinstance(error, InputError) and error.element is not None:
                 error.element = _as_written(error, error.element, command)
             say("error", error)
-            raise typer.Exit(BAD_INPUT) from error
+            raise typer.Exit(
+                RUN_FAILED if isinstance(error, AnalysisError) else BAD_INPUT
+            ) from error
         except OSError as error:
             where = f"{error.filename}: " if error.filename else ""
             say("error", f"{where}{error.strerror or error}")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from srm_mbs._typing import FloatArray
-from srm_mbs.errors import ControllerError, InputError, safe_repr, time_text
+from srm_mbs.errors import ControllerError, InputError, raised, safe_repr, time_text
 from srm_mbs.model.mechanism import MechanismData
 from srm_mbs.model.numbers import real_array
 
@@ -102,7 +102,7 @@ def forces_of_joints(
         if isinstance(own, str):
             wanted = "a finite number" if joint.nv == 1 else f"{joint.nv} finite numbers"
             raise ControllerError(
-                f"{own_name} is {own} at t = {time_text(t)} s; it must be {wanted}", t
+                f"{own_name} is given as {own} at t = {time_text(t)} s; it must be {wanted}", t
             )
         tau[joint.idx_v : joint.idx_v + joint.nv] = own
     return tau
@@ -141,9 +141,7 @@ def _output(name: str, function: Controller, t: float, q: FloatArray, v: FloatAr
     except ControllerError:  # of a controller of this package, whose message is complete
         raise
     except Exception as error:
-        raise ControllerError(
-            f"{name} raised {safe_repr(error)} at t = {time_text(t)} s", t
-        ) from error
+        raise ControllerError(raised(name, error, f"at t = {time_text(t)} s"), t) from error
 
 
 def _numbers(given: Any, size: int, scalar: bool = False) -> FloatArray | str:

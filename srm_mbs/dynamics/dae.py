@@ -31,7 +31,7 @@ from scipy.linalg import lapack
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.projection import PIVOT_ZERO, pivoted_qr, q_columns, whiten
 from srm_mbs.dynamics.system import Zone
-from srm_mbs.errors import CallbackError, EvaluationError, InputError, safe_repr, time_text
+from srm_mbs.errors import CallbackError, EvaluationError, InputError, raised, time_text
 from srm_mbs.model.dae import SemiExplicitDAE
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import all_finite, real_array
@@ -426,9 +426,7 @@ class DaeSystem:
         try:
             value = real_array(getattr(self.problem, name)(t, x.copy()))
         except Exception as error:
-            raise CallbackError(
-                f"{name} raised {safe_repr(error)} at t = {time_text(t)}"
-            ) from error
+            raise CallbackError(raised(name, error, f"at t = {time_text(t)}")) from error
         shape = self.shapes[name]
         if value.shape != shape:
             if value.shape not in self._accepted[name]:
@@ -452,7 +450,7 @@ class DaeSystem:
             value = real_array(self.problem.g(t, x.copy()))
         except Exception as error:
             raise InputError(
-                f"g raised {safe_repr(error)} at the start",
+                raised("g", error, "at the start"),
                 element="g",
                 remedy="Give a function of (t, x) that returns (ny,) values",
             ) from error

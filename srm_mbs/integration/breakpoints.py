@@ -174,7 +174,11 @@ def beside_singular(
     try:
         return start(system, method, t, state, norm, end, fresh)
     except InputError as error:
-        raise EvaluationError(f"at the breakpoint {error}") from error
+        # The remedy of the error is for those who can choose the state.
+        raise EvaluationError(
+            f"at the breakpoint {error.problem}; let drives and forces change beside it, at "
+            "another time"
+        ) from error
 
 
 class BreakpointHandler:

@@ -13,7 +13,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
-from srm_mbs.errors import ControllerError, EvaluationError, EventError, safe_repr, time_text
+from srm_mbs.errors import ControllerError, EvaluationError, EventError, raised, time_text
 from srm_mbs.integration.breakpoints import BreakpointHandler
 from srm_mbs.integration.control.step_size import (
     Proposal,
@@ -560,7 +560,7 @@ def call_progress(tick: Tick, t: float, h: float, x: FloatArray, unit: str = " s
         tick(t, h, x.copy())
     except Exception as error:
         raise ControllerError(
-            f"the progress callback raised {safe_repr(error)} at t = {time_text(t)}{unit}"
+            raised("the progress callback", error, f"at t = {time_text(t)}{unit}")
         ) from error
 
 

@@ -47,7 +47,7 @@ import numpy as np
 
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.system import System
-from srm_mbs.errors import EvaluationError, EventError, InputError, safe_repr, time_text
+from srm_mbs.errors import EvaluationError, EventError, InputError, raised, safe_repr, time_text
 from srm_mbs.integration.dense_output import DenseOutput, step_data
 from srm_mbs.integration.methods.base import StepResult
 from srm_mbs.integration.methods.butcher import ButcherTableau
@@ -187,7 +187,7 @@ class EventFunction:
     def fail(self, error: Exception, t: float) -> NoReturn:
         """Raise the EventError of a function that raised ``error`` at ``t`` (s)."""
         at = f"t = {time_text(t)}{self.time_unit}"
-        raise EventError(f"the event {self.name} raised {safe_repr(error)} at {at}", t) from error
+        raise EventError(raised(f"the event {self.name}", error, f"at {at}"), t) from error
 
     def floor_at(self, t: float, state: FloatArray) -> float:
         """Size of values that count as zero at ``t`` (s) and ``state``."""

@@ -551,7 +551,7 @@ def describe_branches(singular: SingularConfiguration, u: FloatArray) -> str:
 
 def _refusal(singular: SingularConfiguration, u: FloatArray, why: str) -> InputError:
     return InputError(
-        f"the start is a singular configuration of {singular.participants} {why}: "
+        f"the state is a singular configuration of {singular.participants} {why}: "
         f"{describe_branches(singular, u)}",
         element="v0",
         remedy="Give rates along one branch: srm.assemble(mechanism, q, v) with the rate of one "
@@ -575,7 +575,7 @@ def _limit_at_start(
         if sigma >= UNDETERMINED_SIGMA:
             return None
         raise InputError(
-            f"the start is almost a singular configuration (sigma = {sigma:.1e}), but none can be "
+            f"the state is almost a singular configuration (sigma = {sigma:.1e}), but none can be "
             "found next to it, so that the direction of the motion stays undetermined",
             element="q0",
             remedy="Start further away, at sigma above 1e-3",

@@ -20,7 +20,16 @@ from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.anchors import Anchor, check_apart, name_places, one_degree_joint
 from srm_mbs.model.closures import LoopClosure
 from srm_mbs.model.copies import short_repr
-from srm_mbs.model.laws import Curve, Law, Polynomial, Sine, Table, check_law, curve_of
+from srm_mbs.model.laws import (
+    Curve,
+    Law,
+    Polynomial,
+    Sine,
+    Table,
+    check_law,
+    curve_of,
+    is_of_package,
+)
 from srm_mbs.model.numbers import checked_name, unit_vector
 
 LAWS_WITH_VALUES = (Table, Polynomial, Sine)
@@ -139,8 +148,20 @@ class Drive:
         return replace(moving, b=Anchor(b.link, b.frame, (x, y, z), b.rpy))
 
     def curve(self, initial: float) -> Curve:
-        """s(t) for the coordinate that is ``initial`` at t = 0."""
+        """s(t) for the coordinate that is ``initial`` at t = 0.
+
+        Raises
+        ------
+        InputError
+            If a law of the user is no curve, or one that no motion follows because it jumps.
+        """
         curve = curve_of(self.law, initial)
+        jump = None if is_of_package(self.law) else curve.jump()
+        if jump is not None:
+            raise self._fault(
+                f"{jump[1]} at t = {jump[0]:g} s, by its law {self.law.type!r}",
+                "Let them be continuous, or let an event change the drive",
+            )
         return curve if self.absolute else curve.shifted(initial - curve(0.0)[0])
 
     def check(self, model: pin.Model) -> None:

@@ -27,6 +27,9 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.errors import InputError, safe_repr
 from srm_mbs.model.numbers import finite_array
 
+CONTINUOUS = 1e-8
+"""Jump of a position (rad, m) or rate (per s), over it plus one, that counts as rounding."""
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -77,6 +80,19 @@ class Curve:
         """The polynomial piece that is active at t (s), extended to all times, with the sines."""
         i = max(bisect_right(self.breaks, t) - 1, 0)
         return Curve((self.breaks[i],), (self.pieces[i],), self.sines)
+
+    def jump(self) -> tuple[float, str] | None:
+        """The first time (s) after 0 at which s or s' jumps, and a clause that says so; None if
+        both are continuous."""
+        for i, t in enumerate(self.breaks[1:], start=1):
+            if t <= 0.0:  # drives begin at 0
+                continue
+            before = Curve((self.breaks[i - 1],), (self.pieces[i - 1],))(t)
+            after = Curve((t,), (self.pieces[i],))(t)
+            for name, left, right in zip(("position", "rate"), before, after):
+                if abs(right - left) > CONTINUOUS * (1.0 + abs(left)):
+                    return t, f"its {name} jumps from {left:.6g} to {right:.6g}"
+        return None
 
     def shifted(self, by: float) -> Curve:
         """The curve s(t) + ``by``."""

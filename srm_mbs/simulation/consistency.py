@@ -253,7 +253,7 @@ def _refusal(
     elif mechanism.drives and t:  # where drives lead to by then, assembly does not know
         remedy = f"Use {projected}, which returns a consistent q and v"
     return InputError(
-        f"the initial state violates the {kind}: row {rows[found.row]} by {found.value:.1e}{also}",
+        f"the state violates the {kind}: row {rows[found.row]} by {found.value:.1e}{also}",
         element=names[found.rate],
         remedy=remedy,
     )

@@ -10,6 +10,7 @@ One row per time, with a header that names each column and its unit:
 * with loops, the closure errors ``||g||`` and their rates ``||G v||``;
 * ``energy (J)``, kinetic plus potential;
 * of points that are asked for, ``rod (1; 0; 0) x (m)``, ``... vx (m/s)``, ``... ax (m/s^2)``;
+  without the last, and with a warning, of a loaded run that had a controller;
 * on request the reactions: ``closure pin fx (N)`` to ``mz (N m)``, and ``joint crank fx (N)``.
 
 Every number is written with as many digits as give the same float back.
@@ -32,7 +33,7 @@ from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.constraints.mobility import COMPONENTS
 from srm_mbs.dynamics.point_motion import point_name
 from srm_mbs.dynamics.scaling import is_angle, row_dimensions
-from srm_mbs.errors import get_logger
+from srm_mbs.errors import InputError, get_logger, warn
 from srm_mbs.formats.csv_table import text_cell
 from srm_mbs.formats.files import writing
 from srm_mbs.model.anchors import Anchor
@@ -75,7 +76,7 @@ def write_csv(
     Raises
     ------
     InputError
-        If a point does not exist; for a loaded run that had a controller.
+        If a point does not exist; for reactions of a loaded run that had a controller.
     OSError
         If the file cannot be written.
     """
@@ -122,16 +123,17 @@ def _cells(column: NDArray[Any]) -> list[Any]:
 
 
 def _motion(solution: SimulationResult, point: Anchor | str) -> dict[str, FloatArray]:
-    """Columns of the motion of a point."""
+    """Columns of the motion of a point, without its accelerations where the run has none."""
     motion = solution.point(point)
     name = point_name(point).replace(",", ";")  # so that nothing is quoted
+    parts = [("", "m", motion.position), ("v", "m/s", motion.velocity)]
+    try:
+        parts.append(("a", "m/s^2", motion.acceleration))
+    except InputError as error:
+        warn(f"the table has no accelerations of points: {error}")
     return {
         f"{name} {prefix}{axis} ({unit})": values[:, k]
-        for prefix, unit, values in (
-            ("", "m", motion.position),
-            ("v", "m/s", motion.velocity),
-            ("a", "m/s^2", motion.acceleration),
-        )
+        for prefix, unit, values in parts
         for k, axis in enumerate("xyz")
     }
 

@@ -703,7 +703,7 @@ class SimulationResult(RunOutcome):
             raise InputError(
                 f"the {what} of a loaded run with a {lost} cannot be computed: "
                 f"{'their functions' if of_forces else 'controllers'} are not saved",
-                remedy="Read it before saving, or simulate again",
+                remedy="Read that before the run is saved, or simulate again",
             )
 
     @cached_property

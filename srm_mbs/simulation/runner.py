@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,6 +182,8 @@ class Problem:
         The generated code that computes the terms; None without it.
     meter
         Counts the time of a run for which code may be compiled; None for others.
+    travelled
+        The coordinates of the segments before; None without them, and without joint limits.
     """
 
     mechanism: Mechanism
@@ -200,6 +202,26 @@ class Problem:
     stiff: bool = False
     code: Any = None
     meter: Meter | None = None
+    travelled: Travelled | None = None
+
+
+class Travelled(NamedTuple):
+    """Coordinates (nq,) of a run so far: at its start, the least and the largest."""
+
+    start: FloatArray
+    least: FloatArray
+    largest: FloatArray
+
+    @classmethod
+    def of(
+        cls, start: FloatArray, least: FloatArray, largest: FloatArray, before: Travelled | None
+    ) -> Travelled:
+        """Those of a part with these coordinates, and of what was ``before`` it."""
+        if before is None:
+            return cls(start, least, largest)
+        return cls(
+            before.start, np.minimum(before.least, least), np.maximum(before.largest, largest)
+        )
 
 
 @dataclass(eq=False, slots=True)
@@ -223,6 +245,16 @@ class Segment(Generic[Result]):
         """q and v (nq + nv,) at its end."""
         state = self.end.state
         return self.result.last_state if state is None else state
+
+    @property
+    def travelled(self) -> Travelled | None:
+        """The coordinates of the run up to its end; None without joint limits."""
+        problem = self.problem
+        if not _limited_joints(problem.mechanism):
+            return problem.travelled
+        q = self.result.q
+        start, least, largest = problem.mechanism.q0, q.min(axis=0), q.max(axis=0)
+        return Travelled.of(start, least, largest, problem.travelled)
 
 
 def run_segment(
@@ -324,7 +356,7 @@ def finished(result: Outcome, options: RunOptions) -> Outcome:
         With ``raise_on_failure``.
     """
     if options.raise_on_failure and not result.success:
-        raise SimulationError(result.message, result)
+        raise SimulationError(result.message, result) from result.error
     return result
 
 
@@ -539,6 +571,7 @@ def assemble_problem(
     if measured:
         problem.meter = Meter(mechanism)
     if before is not None:
+        problem.travelled = before.travelled
         problem.stiff = before.end.stiff
         if known is not None:
             problem.last_step = _repeated_step(before.end)
@@ -894,6 +927,7 @@ class FinishedRun:
         self._mechanism, self._norm = problem.mechanism, problem.norm
         self._options = options if options.progress is False else options._replace(progress=False)
         self.backend, self._passages = problem.backend, problem.passages
+        self._travelled = problem.travelled
         self._kernel_system = None if shared(problem.system) else kernel_system
         self._record, self._counters = record, counters
         if record.status is RunStatus.INTERRUPTED:
@@ -938,7 +972,9 @@ class FinishedRun:
     @cached_property
     def nodes(self) -> tuple[FloatArray, FloatArray]:
         record = self._record
-        found = record.nodes() if isinstance(record, CompiledRecord) else None
+        # A stream took the steps out of the record.
+        whole = isinstance(record, CompiledRecord) and not self._streamed
+        found = cast(CompiledRecord, record).nodes() if whole else None
         if found is not None:
             return found
         return cast(DenseOutput, self.dense).nodes()
@@ -1037,7 +1073,8 @@ class FinishedRun:
             # The reductions themselves: their methods cost more than they do here.
             least, largest = np.minimum.reduce(q), np.maximum.reduce(q)
             turned = over_half_turn(self._mechanism, q)
-        return _limits_left(self._mechanism, least, largest) + _half_turns(turned)
+        so_far = Travelled.of(self._mechanism.q0, least, largest, self._travelled)
+        return _limits_left(self._mechanism, so_far) + _half_turns(turned)
 
 
 def assemble_result(
@@ -1125,17 +1162,21 @@ def _limited_joints(mechanism: Mechanism) -> list[tuple[str, int, float, float]]
     return limited
 
 
-def _limits_left(mechanism: Mechanism, least: FloatArray, largest: FloatArray) -> str:
-    """A sentence naming the one-degree joints that left their limits, which do not act; ``least``
-    and ``largest`` (nq,) are their coordinates."""
+def _limits_left(mechanism: Mechanism, run: Travelled) -> str:
+    """A sentence naming the one-degree joints that started beyond their limits, which do not act,
+    and those that left them."""
     limited = _limited_joints(mechanism)
     if not limited:
         return ""
-    lows, highs = least.tolist(), largest.tolist()
-    left = []
+    lows, highs = run.least.tolist(), run.largest.tolist()
+    started: list[str] = []
+    left: list[str] = []
     for name, i, low, high in limited:
         # A run that a terminal event ends at a limit has not left it.
         slack = LIMIT_ROUNDING * max(1.0, -lows[i], highs[i])
         if max(low - lows[i], highs[i] - high) > slack:
-            left.append(name)
-    return f" Joint limits do not act; these joints left theirs: {', '.join(left)}." if left else ""
+            inside = low - slack <= run.start[i] <= high + slack
+            (left if inside else started).append(name)
+    clauses = [f"these joints left theirs: {', '.join(left)}"] if left else []
+    clauses += [f"these joints started beyond theirs: {', '.join(started)}"] if started else []
+    return f" Joint limits do not act; {'; '.join(clauses)}." if clauses else ""

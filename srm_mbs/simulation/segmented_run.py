@@ -17,7 +17,15 @@ import numpy as np
 from srm_mbs._typing import FloatArray
 from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
-from srm_mbs.errors import EvaluationError, EventError, InputError, get_logger, safe_repr, time_text
+from srm_mbs.errors import (
+    EvaluationError,
+    EventError,
+    InputError,
+    get_logger,
+    raised,
+    safe_repr,
+    time_text,
+)
 from srm_mbs.integration.contacts import Contact, ContactProbe
 from srm_mbs.integration.driver import RunStatus
 from srm_mbs.integration.events import (
@@ -248,9 +256,7 @@ class _RunEvent:
         try:
             return None if action is None else action(t, q, v)
         except Exception as error:
-            raise EventError(
-                f"the action of the event {self.name!r} raised {safe_repr(error)}"
-            ) from error
+            raise EventError(raised(f"the action of the event {self.name!r}", error)) from error
 
     def check_chatter(self, t: float, span: float) -> None:
         """Record an action at ``t`` (s); refuse too many within a part of the length ``span``."""

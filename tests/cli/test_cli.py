@@ -620,10 +620,12 @@ def test_csv_names_file_element_and_remedy_of_what_it_refuses(
         assert all(part in line for part in parts), line
     controlled, empty = tmp_path / "controlled.npz", tmp_path / "empty.npz"
     srm.simulate(srm.load("four_bar"), 0.1, controller=lambda t, q, v: np.zeros(3)).save(controlled)
-    for words in (("--reactions",), ("--point", "rocker:1,0,0")):
-        line = error_line(run("csv", controlled, *words, status=2))
-        assert line.startswith(f"error: {controlled}: {words[0]}: the "), line
-        assert line.endswith("simulate again"), line
+    line = error_line(run("csv", controlled, "--reactions", status=2))
+    assert line.startswith(f"error: {controlled}: --reactions: the "), line
+    assert line.endswith("simulate again"), line
+    table = run("csv", controlled, "--point", "rocker:1,0,0", "--out", "-")
+    assert "warning: the table has no accelerations of points: " in table
+    assert "rocker (1; 0; 0) vz (m/s)" in table
     empty.touch()
     assert f"error: {empty}: " in run("csv", empty, status=2)
 

@@ -45,6 +45,37 @@ def test_equilibrium_prints_stability_and_what_holds() -> None:
     assert "on a singular configuration" in run("equilibrium", "slider_crank")
 
 
+def test_a_search_that_finds_nothing_exits_with_1(tmp_path: Path) -> None:
+    falling = """
+        format = 1
+        [planar]
+        points = { A = [0, 0], B = [1, 0] }
+        bar = [{ name = "bar", points = ["B", "A"] }]
+        slider = [{ name = "slide", point = "A", along = [0, 1] }]
+        ground = []
+        mass_per_length = 1.0
+    """
+    path = tmp_path / "falling.toml"
+    path.write_text(falling, encoding="utf-8")
+    assert "no stable equilibrium was found" in run("equilibrium", path, status=1)
+
+
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        (["simulate", "four_bar", "--t-end", "0.1", "--q", "crank=30"], "--q"),
+        (["equilibrium", "four_bar", "--hold", "crank=30"], "--hold"),
+        (["drag", "four_bar", "crank=30"], "JOINT=VALUE"),
+    ],
+    ids=lambda value: value[0],
+)
+def test_angles_that_may_be_in_degrees_are_doubted_as_those_of_files(
+    command: list[str], option: str
+) -> None:
+    said = f"warning: {option}: the angle 30 of the joint 'crank' is more than two turns: angles "
+    assert said + "are in rad, and 30 degrees are 0.523599 rad" in run(*command)
+
+
 def test_positions_beyond_the_limits_of_their_joints_are_marked(
     tmp_path: Path, describe: Describe
 ) -> None:

@@ -220,6 +220,36 @@ def test_an_inclined_axis_in_a_planar_loop_is_the_cause_that_is_named(
     assert raised.value.residuals["pin"][0] > 1e-5  # type: ignore[operator]
 
 
+def as_hinge(axis: str) -> Callable[[str], str]:
+    """Makes a hinge of the closure."""
+
+    def apply(text: str) -> str:
+        return text.replace('type = "point"', f'type = "revolute"\naxis = {axis}')
+
+    return apply
+
+
+def test_an_inclined_axis_of_a_closure_is_the_cause_that_is_named(
+    changed: Callable[..., Path],
+) -> None:
+    with pytest.raises(srm.AssemblyError) as raised:
+        srm.load(changed(toml=as_hinge("[2.0, 0.0, 0.0]")))
+    assert raised.value.element == "loop 'pin'"
+    assert raised.value.problem.startswith(
+        "in the loop 'pin' the axis of the closure is inclined by 90 degrees to those of 'crank', "
+        "'coupler', 'rocker', which are parallel: the loops cannot be closed"
+    )
+
+
+def test_a_closure_with_the_axis_of_two_joints_tells_which_third_is_inclined(
+    changed: Callable[..., Path],
+) -> None:
+    with pytest.raises(srm.AssemblyError) as raised:
+        srm.load(changed(with_axis("crank", "0 0 1"), as_hinge("[0.0, 1.0, 0.0]")))
+    assert raised.value.element == "joint 'crank'"
+    assert "to those of 'coupler', 'rocker', 'pin', which" in raised.value.problem
+
+
 def test_loops_that_close_and_cannot_move_for_an_inclined_axis_are_doubted(
     changed: Callable[..., Path],
 ) -> None:

@@ -325,3 +325,22 @@ def test_a_run_that_stops_at_a_dead_point_says_when_and_which_drive_and_nothing_
     assert "the joint 'slider' is at 4 m, and the closures let it go to 4 m" in solution.message
     assert "stiff" not in solution.message.lower()
     assert solution.settings.stiff == ()
+
+
+@on_both
+def test_a_drive_that_comes_to_rest_on_a_change_point_is_told_without_words_about_a_start(
+    backend: str,
+) -> None:
+    bars = load("parallelogram")
+    drive = srm.Drive(srm.MinimumJerk(target=0.0, duration=1.0), joint="crank")
+    driven = replace(bars, drives=(drive,))
+    start = srm.assemble(driven, bars.q0)
+    with pytest.warns(srm.FailedRunWarning):
+        run = srm.simulate(driven.with_state(start.q, start.v), 2.0, backend=backend)
+    assert run.t[-1] == pytest.approx(1.0)
+    assert run.message.startswith(
+        "Stopped at t = 1 s: at the breakpoint the state is a singular configuration of the "
+        "closures (loops 'pin') and its velocity does not choose one branch"
+    )
+    assert "let drives and forces change beside it" in run.message
+    assert "srm.assemble" not in run.message

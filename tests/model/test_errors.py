@@ -68,6 +68,49 @@ def test_copies_of_an_error_say_what_it_says(fail: Callable[[], None], copied: A
     assert vars(other).keys() == vars(error).keys()
 
 
+def by_nothing(t: float) -> float:
+    return 1.0 / (t < 0.1)
+
+
+LINE = by_nothing.__code__.co_firstlineno + 1
+
+
+@pytest.mark.parametrize("backend", ["python", "kernel"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"controller": lambda t, q, v: [by_nothing(t), 0.0, 0.0]},
+        {"controller": lambda t, q, v: [by_nothing(t), 0.0, 0.0], "sample_time": 0.05},
+        {"events": lambda t, q, v: by_nothing(t)},
+        {"events": srm.Event(lambda t, q, v: t - 0.5, action=lambda t, q, v: by_nothing(t))},
+    ],
+    ids=["controller", "sampled", "event", "action"],
+)
+def test_the_message_names_the_line_of_a_function_that_raises(
+    options: dict[str, Any], backend: str
+) -> None:
+    """Below the first function of the user, and without the folder of its file."""
+    with pytest.warns(srm.FailedRunWarning):
+        solution = srm.simulate(srm.load("four_bar"), 1.0, backend=backend, **options)
+    assert f", in 'by_nothing' (test_errors.py, line {LINE})." in solution.message
+    assert not solution.success
+
+
+def test_a_library_that_raises_is_not_the_place_that_is_named() -> None:
+    def solving(t: float, q: Any, v: Any) -> Any:
+        return np.linalg.solve(np.zeros((3, 3)), q)
+
+    with pytest.raises(srm.FunctionError, match=r"in 'solving' \(test_errors\.py, line \d+\)$"):
+        srm.simulate(srm.load("four_bar"), 1.0, controller=solving)
+
+
+def test_an_error_on_request_has_the_cause_of_the_failure() -> None:
+    with np.errstate(all="ignore"), pytest.raises(srm.SimulationError) as caught:
+        srm.simulate(srm.load("four_bar"), 1.0, controller=dividing, raise_on_failure=True)
+    assert caught.value.__cause__ is caught.value.solution.error
+    assert isinstance(caught.value.__cause__, srm.ControllerError)
+
+
 def test_an_error_in_another_process_arrives_and_the_process_goes_on() -> None:
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         with pytest.raises(srm.InputError, match="there is no bundled mechanism") as caught:

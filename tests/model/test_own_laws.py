@@ -77,6 +77,31 @@ def test_a_drive_follows_a_law_of_ones_own_exactly(law: Law, moved: float, backe
     assert run.energy_balance.relative < 1e-9
 
 
+@pytest.mark.parametrize(
+    ("piece", "said"),
+    [
+        ((0.7, 1.0), "its position jumps from 0.5 to 0.7 at t = 0.5 s"),
+        ((0.5, 3.0), "its rate jumps from 1 to 3 at t = 0.5 s"),
+    ],
+)
+@pytest.mark.parametrize("knots", [[], [0.5]], ids=["unknown", "knot"])
+def test_a_drive_whose_law_jumps_is_refused(
+    piece: tuple[float, float], said: str, knots: list[float]
+) -> None:
+    """No motion follows it: the closures would stay open by the jump."""
+    law = Given(Curve((0.0, 0.5), ((0.0, 1.0), piece)), knots)
+    with pytest.raises(srm.InputError, match=f"drive 'crank': {said}, by its law 'given'"):
+        driven(law)
+
+
+def test_jumps_before_the_start_and_of_forces_are_no_jumps_of_a_drive() -> None:
+    start = Curve((-1.0, 0.0), ((0.0, 0.0), (0.0, 1.0)))  # at rest until 0
+    assert srm.simulate(driven(Given(start)), 0.2).success
+    push = srm.JointTorque("crank", law=Given(Curve((0.0, 0.1), ((0.0,), (1.0,))), [0.1]))
+    pushed = replace(srm.load("slider_crank_regular"), forces=[push])
+    assert srm.simulate(pushed, 0.2).success
+
+
 @on_both
 def test_a_torque_follows_a_law_of_ones_own(backend: str) -> None:
     mechanism = srm.load("slider_crank_regular")

@@ -109,6 +109,26 @@ def test_a_loaded_run_with_a_controller_has_positions_and_velocities_of_points(
         _ = motion.acceleration
 
 
+def test_the_table_of_a_loaded_run_with_a_controller_has_what_is_known_of_points(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.npz"
+    ran = finished(load("slider_crank"), 0.2, controller=lambda t, q, v: [np.sin(t), 0.0])
+    ran.save(path)
+    ran.to_csv(tmp_path / "before.csv", points=[MIDDLE])
+    with pytest.warns(srm.SrmWarning, match="no accelerations of points: .*are not saved"):
+        srm.load_solution(path).to_csv(tmp_path / "after.csv", points=[MIDDLE])
+    before, after = (
+        np.genfromtxt(tmp_path / f"{name}.csv", delimiter=",", dtype=str, comments=None)
+        for name in ("before", "after")
+    )
+    known = [
+        " ax (" not in name and " ay (" not in name and " az (" not in name for name in before[0]
+    ]
+    assert len(known) - sum(known) == 3
+    np.testing.assert_array_equal(after, before[:, known])
+
+
 @pytest.mark.parametrize(
     ("point", "words"),
     [

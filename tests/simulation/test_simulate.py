@@ -386,8 +386,35 @@ def test_leaving_joint_limits_is_said() -> None:
     model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
     solution = srm.simulate(srm.Mechanism(model), 1.0)
     assert solution.success
-    assert "swing" in solution.message
-    assert "limits do not act" in solution.message
+    assert "limits do not act; these joints left theirs: swing." in solution.message
+
+
+@pytest.mark.parametrize("backend", ["python", "auto"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"t_eval": [0.0, 0.1]},
+        # Back within the limits, by an action, before the end.
+        {"events": srm.Event(lambda t, q, v: t - 0.09, action=lambda t, q, v: (0.0 * q, v))},
+        {"events": srm.Event(lambda t, q, v: t - 0.09, action=lambda t, q, v: (q, v))},
+    ],
+    ids=["steps", "outputs", "back", "segments"],
+)
+def test_joints_that_start_beyond_their_limits_are_not_said_to_have_left_them(
+    options: dict[str, Any], backend: str
+) -> None:
+    model = pin.Model()
+    for name in ("inside", "left", "beyond"):
+        joint = model.addJoint(0, pin.JointModelRY(), along_x(0.0), name)
+        model.appendBodyToJoint(joint, rod(), pin.SE3.Identity())
+    model.lowerPositionLimit, model.upperPositionLimit = np.full(3, -0.5), np.full(3, 0.5)
+    bars = srm.Mechanism(model, v0=[0.0, 9.0, 0.0])
+    solution = srm.simulate(bars, 0.1, q0=[0.0, 0.0, 0.7], backend=backend, **options)
+    assert (
+        " Joint limits do not act; these joints left theirs: left; these joints started beyond "
+        "theirs: beyond."
+    ) in solution.message
 
 
 @pytest.mark.parametrize("backend", ["python", "auto"])

@@ -24,11 +24,11 @@ The schemes themselves are in :mod:`srm_mbs.integration.methods.tableaus`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from fractions import Fraction
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,7 +50,7 @@ class _Record:
     """Pickles and copies by construction, so that copies are read-only and validated as well."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        values = (getattr(self, field.name) for field in fields(self))
+        values = (getattr(self, each.name) for each in fields(self))
         return type(self), tuple(dict(v) if isinstance(v, MappingProxyType) else v for v in values)
 
 
@@ -134,6 +134,22 @@ class DenseExtension(_Record):
         return value, slope
 
 
+Number = TypeVar("Number", Fraction, float)
+
+
+def hermite(b: tuple[Number, ...], n_extra: int = 0) -> tuple[tuple[Number, ...], ...]:
+    """F_0, F_1, F_2 (s + 1 + n_extra,) of the cubic through both end states and both end rates
+    (HNW, II.6), for the weights ``b`` (s,)."""
+    weights = list(b)
+    weights += [b[0] - b[0]] * (1 + n_extra)
+    outer = [(w, i == 0, i == len(b)) for i, w in enumerate(weights)]
+    return (
+        tuple(weights),
+        tuple(first - w for w, first, _ in outer),
+        tuple(2 * w - first - last for w, first, last in outer),
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class ExactTableau(_Record):
     """The data of a rational tableau in fractions.
@@ -179,9 +195,9 @@ class ButcherTableau(_Record):
     embedded_order, controller_order
         Order of bhat; k of the exponents 1/k of step-size control.  None without embedded pair.
     dense
-        The default continuous extension.
+        The default continuous extension; by default the cubic Hermite polynomial, of order 3.
     extensions
-        All continuous extensions by name.
+        All continuous extensions by name; by default that one.
     exact
         The same data in fractions; None if the scheme is not rational.
     implicit : (s, s) or None
@@ -204,12 +220,12 @@ class ButcherTableau(_Record):
     A: FloatArray
     b: FloatArray
     c: FloatArray
-    error: FloatArray | None
-    embedded_order: int | None
-    controller_order: int | None
-    dense: DenseExtension
-    extensions: Mapping[str, DenseExtension]
-    exact: ExactTableau | None
+    error: FloatArray | None = None
+    embedded_order: int | None = None
+    controller_order: int | None = None
+    dense: DenseExtension = None  # type: ignore[assignment]  # one is made
+    extensions: Mapping[str, DenseExtension] = field(default_factory=dict)
+    exact: ExactTableau | None = None
     implicit: FloatArray | None = None
     stable_to: float | None = None
     stiff: ButcherTableau | None = None
@@ -229,9 +245,16 @@ class ButcherTableau(_Record):
         if self.error is not None:
             _freeze(self, owner, error=(s + 1,))
             _check_sums(self.error[None, :], np.zeros(1), f"{owner}: sum of error")
-        object.__setattr__(self, "extensions", MappingProxyType(dict(self.extensions)))
+        if self.dense is None:
+            rows, none = np.array(hermite(tuple(self.b.tolist()))), np.zeros(0)
+            cubic = DenseExtension(
+                "hermite", min(self.order, 3), 1, rows, none.reshape(0, s + 1), none
+            )
+            object.__setattr__(self, "dense", cubic)
         if not isinstance(self.dense, DenseExtension):
             raise ValueError(f"{owner}: dense is {self.dense!r}, not a DenseExtension")
+        extensions = dict(self.extensions) or {self.dense.name: self.dense}
+        object.__setattr__(self, "extensions", MappingProxyType(extensions))
         if self.extensions.get(self.dense.name) is not self.dense:
             raise ValueError(f"{owner}: dense ({self.dense.name!r}) is not one of its extensions")
         for name, extension in self.extensions.items():

@@ -26,6 +26,7 @@ from srm_mbs.integration.methods.butcher import (
     ExactMatrix,
     ExactRow,
     ExactTableau,
+    hermite,
 )
 from srm_mbs.model.numbers import choice
 
@@ -68,17 +69,6 @@ def _padded(rows: Iterable[Sequence[Any]], width: int) -> FloatArray:
     return np.array([[*map(float, row), *[0.0] * (width - len(row))] for row in rows])
 
 
-def _hermite(b: ExactRow, n_extra: int = 0) -> ExactMatrix:
-    """F_0, F_1, F_2 of the cubic through both end states and both end rates (HNW, II.6)."""
-    weights = (*b, *[Fraction(0)] * (1 + n_extra))
-    outer = [(w, i == 0, i == len(b)) for i, w in enumerate(weights)]
-    return (
-        weights,
-        tuple(first - w for w, first, _ in outer),
-        tuple(2 * w - first - last for w, first, last in outer),
-    )
-
-
 def _nested(p1: Fraction, p2: Fraction, p3: Fraction, p4: Fraction) -> ExactRow:
     """F_0 ... F_3 of p1 theta + p2 theta^2 + p3 theta^3 + p4 theta^4."""
     f2 = -p3 - 2 * p4
@@ -106,7 +96,7 @@ def _rational(
     s = len(weights)
     zero = Fraction(0)
     if extensions is None:
-        extensions = {"hermite": (min(order, 3), 1, _hermite(weights))}
+        extensions = {"hermite": (min(order, 3), 1, hermite(weights))}
     hat, embedded_order, controller_order = pair or (None, None, None)
     bhat = error = None
     if hat is not None:
@@ -178,7 +168,7 @@ def _dopr54() -> ButcherTableau:
         c="0 1/5 3/10 4/5 8/9 1",
         pair=("5179/57600 0 7571/16695 393/640 -92097/339200 187/2100 1/40", 4, 5),
         extensions={
-            "C1": (4, 1, (*_hermite(_fractions(b)), d)),
+            "C1": (4, 1, (*hermite(_fractions(b)), d)),
             "thesis": (4, 0, tuple(zip(*columns, strict=True))),
         },
         stable_to=3.25,
@@ -188,12 +178,12 @@ def _dopr54() -> ButcherTableau:
 def _dop853() -> ButcherTableau:
     s, n_extra = len(dop853_coefficients.B), len(dop853_coefficients.EXTRA_C)
     n_rates = s + 1 + n_extra
-    hermite = _hermite(tuple(map(Fraction, dop853_coefficients.B)), n_extra)
+    cubic = hermite(tuple(map(Fraction, dop853_coefficients.B)), n_extra)
     dense = DenseExtension(
         name="dop853",
         order=7,
         continuity=1,
-        rows=_padded((*hermite, *dop853_coefficients.D), n_rates),
+        rows=_padded((*cubic, *dop853_coefficients.D), n_rates),
         extra_A=_padded(dop853_coefficients.EXTRA_A, n_rates),
         extra_c=np.array(dop853_coefficients.EXTRA_C),
     )

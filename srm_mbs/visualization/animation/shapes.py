@@ -363,7 +363,7 @@ def bar_ends(
     list of lists of (3,) m
         For each joint, of which 0 is the ground, in its frame.
     list of int
-        Joints without others and without anchors: their bar ends in the centre of mass.
+        Joints without others and anchors beside their origin: their bar ends in the centre of mass.
     """
     model = mechanism.model
     ends: list[list[FloatArray]] = [[] for _ in range(model.njoints)]
@@ -376,7 +376,7 @@ def bar_ends(
     masses = [
         joint
         for joint in range(1, model.njoints)
-        if not ends[joint] and np.linalg.norm(model.inertias[joint].lever) > 0.0
+        if not np.any(ends[joint]) and np.any(model.inertias[joint].lever)
     ]
     for joint in masses:
         ends[joint].append(model.inertias[joint].lever)

@@ -472,6 +472,19 @@ def changed(array: FloatArray, index: Any, value: float) -> FloatArray:
 ERK4, DOPR54, DOP853 = TABLEAUS["erk4"], TABLEAUS["dopr54"], TABLEAUS["dop853"]
 
 
+def test_a_tableau_without_an_extension_has_the_cubic_hermite_polynomial() -> None:
+    own = TABLEAUS["erk4"]
+    plain = ButcherTableau("plain", own.order, "", own.A, own.b, own.c)
+    assert plain.extensions == {"hermite": plain.dense}
+    for name in ("order", "continuity"):
+        assert getattr(plain.dense, name) == getattr(own.extensions["hermite"], name)
+    np.testing.assert_allclose(
+        plain.dense.rows, own.extensions["hermite"].rows, rtol=0.0, atol=2e-16
+    )
+    copied = pickle.loads(pickle.dumps(plain))
+    np.testing.assert_array_equal(copied.dense.rows, plain.dense.rows)
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -497,7 +510,7 @@ ERK4, DOPR54, DOP853 = TABLEAUS["erk4"], TABLEAUS["dopr54"], TABLEAUS["dop853"]
             {"dense": DOPR54.dense, "extensions": {"C1": DOPR54.dense}, "b": np.eye(6)[0]},
             "does not end at the end state",
         ),
-        ({"dense": None}, "dense is None, not a DenseExtension"),
+        ({"dense": "C1"}, "dense is 'C1', not a DenseExtension"),
         ({"order": 6}, r"order of b is 6, but t\^5 is integrated with an error of"),
         ({"embedded_order": 5}, r"embedded_order is 5, but t\^4 is integrated"),
     ],

@@ -122,6 +122,21 @@ def spatial_four_bar() -> srm.Solution:
     return srm.simulate(load("spatial_four_bar"), 2.0)
 
 
+def test_a_body_that_closures_hold_at_its_origin_is_a_bar_to_its_centre_of_mass() -> None:
+    model = pin.Model()
+    for name in ("carrier", "load"):
+        joint = model.addJoint(model.njoints - 1, pin.JointModelRY(), pin.SE3.Identity(), name)
+        model.addBodyFrame(name, joint, pin.SE3.Identity(), 0)
+    lever = np.array([0.6, 0.0, 0.3])
+    model.appendBodyToJoint(joint, pin.Inertia(1.0, lever, 0.1 * np.eye(3)), pin.SE3.Identity())
+    held = srm.LoopClosure("point_on_plane", srm.Anchor("load"), srm.Anchor("world"), (0, 1, 0))
+    own = [each for each in visuals_of(srm.Mechanism(model, loops=[held])) if each.joint == joint]
+    (bar,) = (each for each in own if isinstance(each.shape, Box))
+    np.testing.assert_allclose(bar.placement.translation, lever / 2.0)
+    np.testing.assert_allclose(bar.shape.size[2], np.linalg.norm(lever))
+    assert any(np.array_equal(each.placement.translation, lever) for each in own)
+
+
 # Key frames
 
 

@@ -1363,6 +1363,12 @@ class Bifurcation:
         return self._crossing.singular
 
     @property
+    def driven(self) -> bool:
+        """Whether the drives alone determine the motion, whatever its momentum."""
+        monitor = self._crossing._monitor
+        return monitor.geometry.model.nv == monitor.rank
+
+    @property
     def configuration(self) -> FloatArray | None:
         """The singular configuration (nq,)."""
         return self._crossing.configuration
@@ -1395,10 +1401,12 @@ class Bifurcation:
         kept = "" if self.kept is None else f", number {self.kept}"
         did = "stopped there" if self.stopped else f"kept the one it came along{kept}"
         number = f"{len(self.branches)} " if len(self.branches) else ""
+        meet = f"without the momentum to choose one of the {number}branches that meet there"
+        if self.driven:
+            meet = f"where {number}branches meet"
         return (
             f"{span if self.end > self.start else moment} next to a singular "
-            f"configuration of {self._crossing.participants} without the "
-            f"momentum to choose one of the {number}branches that meet there: the run {did} "
+            f"configuration of {self._crossing.participants} {meet}: the run {did} "
             "(solution.bifurcations)"
         )
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
-from tests.support import reduced
+from tests.support import reduced, turning
 from tests.support.bundled import load
 from tests.support.slider_crank import START, off_branch
 
@@ -49,6 +49,7 @@ def test_a_motion_that_comes_to_rest_on_a_change_point_reports_branches_and_whic
     assert solution.success
     (bifurcation,) = solution.bifurcations
     assert bifurcation.start == pytest.approx(0.558, abs=1e-3)
+    assert not bifurcation.driven
     assert bifurcation.distance < 1e-6
     assert bifurcation.loops == ("pin",)
     assert not bifurcation.stopped
@@ -63,6 +64,15 @@ def test_a_motion_that_comes_to_rest_on_a_change_point_reports_branches_and_whic
     assert "turned back next to a singular configuration" in solution.message
     assert "loops 'pin'" in solution.message
     assert "2 branches" in solution.message
+
+
+def test_of_a_driven_mechanism_that_rests_on_a_change_point_no_momentum_is_spoken_of() -> None:
+    solution = srm.simulate(turning.driven(0.0, 1.0).mechanism, 4.0)
+    (bifurcation,) = solution.bifurcations
+    assert bifurcation.driven
+    assert "turned back next to a singular configuration of" in solution.message
+    assert "where branches meet: the run kept" in solution.message
+    assert "momentum" not in solution.message
 
 
 def test_a_braked_mechanism_comes_to_rest_on_a_singular_configuration() -> None:

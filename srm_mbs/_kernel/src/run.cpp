@@ -407,7 +407,6 @@ bool Run::avoids(const CriticalConfiguration& critical) const {
 // Examines the passage at `zero`, which is expected or lies in a step, and prepares the steps along
 // the curve if ordinary steps are not to make it; whether there are any.
 bool Run::examine(double zero, bool expected) {
-    const double rtol = step.norm.rtol;
     examine_below_ = constants().examined_again * memory.sigma;
     UnitClosures closures(system, zero - t_);
     const auto critical = critical_of_passage(closures, t_, state.data(), memory.rate.data(), zero,
@@ -416,7 +415,7 @@ bool Run::examine(double zero, bool expected) {
     avoided_.reset();
     if (!critical) return false;
     const double residual = std::abs(critical->residual);
-    if (!(residual > constants().rounded_residual)) return false;
+    if (!(residual > constants().stepped_residual)) return false;
     if (expected) {  // another one may lie between
         std::vector<double> covered(closures.n);
         closures.difference(critical->x, critical->t, state, t_, covered.data());
@@ -425,15 +424,10 @@ bool Run::examine(double zero, bool expected) {
             return false;
         }
     }
-    const bool avoided = residual > singular_tolerance_;
-    // Steps may pass a residual that is far below the tolerance, but not end beside it.
-    const bool disturbs = residual > constants().disturbing * rtol;
-    bool steps_pass = false;
-    if (avoided || disturbs || intervals_.ends[interval_] < zero + (zero - t_)) {
-        follow({*critical, closures.time_unit, !avoided});
-        // A motion that is still to turn back is examined again.
-        steps_pass = prepared_.empty() && one_freedom_;
-    }
+    const bool avoided = avoids(*critical);
+    follow({*critical, closures.time_unit, !avoided});
+    // A motion that is still to turn back is examined again.
+    const bool steps_pass = prepared_.empty() && one_freedom_;
     const ExaminedPassage found{zero, critical->residual, avoided, !prepared_.empty()};
     if (known_ && steps_pass && !expected) unresolved_ = found;
     known_ = (known_ && !steps_pass) || !prepared_.empty();

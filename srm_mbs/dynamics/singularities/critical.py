@@ -410,6 +410,15 @@ class CurveThroughSaddle:
         kept, slope = self._sign * kept, self._sign * slope
         return beta * self.along + kept * self._kept, self.along + slope * self._kept
 
+    def turn_of(self, i: int) -> tuple[float, float] | None:
+        """beta at which the coordinate ``i`` turns back along the hyperbola, and the sign of its
+        second derivative there; None if it does not."""
+        along = float(self.along[i])
+        kept = self._sign * float(np.sqrt(self._ratio) * self._kept[i])
+        if not abs(along) < abs(kept):
+            return None
+        return self.width * float(np.sinh(np.arctanh(-along / kept))), float(np.sign(kept))
+
     def linearised(
         self, x: FloatArray, beta: float, closed: bool = False
     ) -> tuple[FloatArray, FloatArray, FloatArray]:

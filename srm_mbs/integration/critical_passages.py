@@ -872,21 +872,41 @@ class CriticalPassages:
             self._rest = layer_motion(self._system, t, state, self._tolerance, START_REACH)
         return self.under_way
 
-    def crossing(self, result: StepResult) -> float | None:
-        """When (s) the step of ``result`` passes a singular configuration that has not been
-        examined; None if it does not."""
+    def crossing(self, state: FloatArray, result: StepResult) -> float | None:
+        """When (s) the step of ``result`` from ``state`` (nx,) passes a singular configuration that
+        has not been examined; None if it does not."""
         self._unresolved = None
         # A step across the middle of a passage may be quiet: sigma is the same at both ends.
         if self._known:
             return None
         lowest = int(np.argmin(result.sigmas))
-        if lowest == 0 or not may_cross(result):
+        if not may_cross(result):
             return None
+        if lowest == 0:
+            # No step before the first one has seen sigma fall, and all its stages may lie beyond.
+            first = np.isinf(self._sigma) and self._one_freedom
+            return self._approached(state, result) if first else None
         abscissae = self._scheme.member(result.stiff).abscissae
         zero = zero_within(abscissae, result.sigmas)
         if zero is None or not 0.0 < zero <= 1.0:
             zero = float(abscissae[lowest])
         return float(result.t + zero * result.h)
+
+    def _approached(self, state: FloatArray, result: StepResult) -> float | None:
+        """When (s) the motion from ``state`` (nx,) comes to the critical configuration next to it;
+        None if that is not within the step of ``result``."""
+        analysis = self._system.singularities
+        q, v = analysis.split(state)
+        geometry = analysis.geometry(analysis.q0, result.t)
+        place = geometry.at(q, result.t)
+        critical = critical_configuration(
+            geometry, analysis.rank, place, SEARCH, self._found, STEPPED_RESIDUAL
+        )
+        if critical is None:
+            return None
+        away, rates = geometry.difference(place, critical.q)[: len(v)], geometry.rates(v)[: len(v)]
+        ahead = float(away @ rates / (rates @ rates))
+        return result.t + ahead if 0.0 < ahead < result.h else None
 
     def unexamined(self, zero: float | None, t: float) -> float | None:
         """The ``zero`` (s) of sigma that is expected after ``t`` (s), unless it was examined."""

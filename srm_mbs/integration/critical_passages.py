@@ -403,7 +403,10 @@ class PassageAlongCurve:
                 at, target = self._panel(at, target), edge
             except ValueError:
                 beyond, before = at >= LAYER, target <= -LAYER
+                bounded = self._bounded(at, target)
                 target = at + SHORTENED * (target - at)
+                if bounded:
+                    continue
                 if self.exact or not (beyond or before):
                     raise
                 if target - at < SHORTEST_PANEL:
@@ -411,6 +414,11 @@ class PassageAlongCurve:
                         raise
                     break
         return at
+
+    def _bounded(self, a: float, b: float) -> bool:
+        """Whether the energy of a straight motion may change by a part only on the panel from
+        ``a`` to ``b``: the shortest ones follow it as well as they can."""
+        return self.exact and not self._driven and b - a > SHORTEST_PANEL
 
     def _closes(self, beta: float) -> bool:
         """Whether the closures are to hold at ``beta``, also where their residual counts as
@@ -571,6 +579,8 @@ class PassageAlongCurve:
         if not (self._driven or self.exact):
             least = LEAST_ENERGY * self._energy if a >= LAYER else 0.0
             most = self._energy / LEAST_ENERGY if b <= -LAYER else np.inf
+        elif self._bounded(a, b):
+            least, most = LEAST_ENERGY * self._energy, self._energy / LEAST_ENERGY
         while True:
             xi = self._heading * (a + (b - a) * x)
             slope = self._width * np.cosh(xi) * self._heading * (b - a)

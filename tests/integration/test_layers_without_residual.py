@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 import srm_mbs as srm
+from tests.integration.test_almost_singular import slider_crank
+from tests.support import reduced
 from tests.support.backends import needs_kernel, on_both
 from tests.support.change_point import CHANGE_POINTS, AlmostChangePoint, StraightOn, turned
 
@@ -172,3 +174,29 @@ def test_a_slow_start_leaves_such_a_layer_before_gravity_turns_it_back(
     run = srm.simulate(mechanism, t_end, rtol=1e-6, backend=backend)
 
     assert_ends(run, motion.after(p, kinetic, ahead, t_end), 1e-4 + 30.0 * np.sqrt(abs(d)) / speed)
+
+
+@on_both
+@pytest.mark.parametrize(
+    ("d", "rtol", "stiffness", "rest", "t_end"),
+    [(-2.1e-12, 8.3e-6, 101.73, -1.7676, 0.4978), (-6.3e-13, 1.04e-7, 85.66, -1.4766, 0.5576)],
+)
+def test_a_spring_that_slows_a_straight_passage_down_is_resolved(
+    d: float, rtol: float, stiffness: float, rest: float, t_end: float, backend: str
+) -> None:
+    """The equal slider-crank on its straight branch, where the rod turns by -2 theta."""
+    almost = slider_crank(d)
+    spring = srm.TorsionSpring("rod", stiffness=stiffness, rest_angle=rest)
+    free = reduced.slider_crank()
+
+    def field(t: float, y: Any) -> list[float]:
+        moment = 2.0 * stiffness * (-2.0 * y[0] - rest)
+        return [y[1], free(t, y)[1] + moment / (8.0 / 3.0 + 8.0 * np.sin(y[0]) ** 2)]
+
+    theta, omega = reduced.integrate(field, [almost.q0[0], almost.v0[0]], t_end)
+
+    run = srm.simulate(replace(almost, forces=(spring,)), t_end, rtol=rtol, backend=backend)
+
+    assert run.success, run.message
+    assert np.abs(run.q[-1] - [theta, -2.0 * theta]).max() < 30.0 * rtol + 10.0 * np.sqrt(abs(d))
+    assert abs(run.v[-1, 0] - omega) < 10.0 * (30.0 * rtol + 10.0 * np.sqrt(abs(d)))

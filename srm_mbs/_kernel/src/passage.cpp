@@ -531,6 +531,12 @@ private:
         }
     }
 
+    // Whether the energy of a straight motion may change by a part only on the panel from a to b: the
+    // shortest ones follow it as well as they can.
+    bool bounded(double a, double b) const {
+        return motion_.exact && !driven_ && b - a > constants_.shortest_panel;
+    }
+
     // Goes on from `at` to the edge, of xi times the heading; returns where that led.  Beyond the
     // layer that may be less, where the motion turns back soon.  Where the energy changes much, panels
     // are shorter.
@@ -542,7 +548,9 @@ private:
                 target = edge;
             } catch (const NoPassage&) {
                 const bool beyond = at >= constants_.layer, before = target <= -constants_.layer;
+                const bool is_bounded = bounded(at, target);
                 target = at + constants_.panel_shortened * (target - at);
+                if (is_bounded) continue;
                 if (motion_.exact || !(beyond || before)) throw;
                 if (target - at < constants_.shortest_panel) {
                     if (before) throw;
@@ -568,6 +576,9 @@ private:
         if (!(driven_ || motion_.exact)) {
             if (a >= constants_.layer) least = constants_.least_energy * energy_;
             if (b <= -constants_.layer) most = energy_ / constants_.least_energy;
+        } else if (bounded(a, b)) {
+            least = constants_.least_energy * energy_;
+            most = energy_ / constants_.least_energy;
         }
         const auto with_start = [](double first, const Vector& values) {
             Vector out{first};

@@ -55,10 +55,10 @@ EXAMINED_AGAIN = 0.7
 """Fall of sigma after which a motion that passes no critical configuration so far is examined
 again; with a dead point ahead, the lowest over the last one in a step that leads past it."""
 ROUNDED_RESIDUAL = 1e-13
-"""Residual (row units) below which the configuration is singular to rounding."""
-DISTURBING = 1e-3
-"""Residual that counts as zero, over rtol, up to which steps pass as if it were, unless they are
-to end beside the passage."""
+"""Residual (row units) below which the configuration counts as singular at every tolerance."""
+STEPPED_RESIDUAL = 1e-14
+"""That up to which steps pass it: rounding.  With a larger one they come into the layer at tight
+tolerances."""
 DEAD_POINT_WIDTH = 1e-2
 """Width (units) of a layer up to which dead points of drives are looked for in it: steps stop at
 others."""
@@ -112,6 +112,11 @@ it is then almost as accurate as its quadrature."""
 START_REACH = 0.1
 """Distance (units) from a critical configuration up to which a motion that starts in its layer is
 followed along the curve."""
+LAYERS_LEFT = 10.0
+"""The same over the width of the layer, at least: there the residual is closed again."""
+SPENT_ENERGY = 0.25
+"""Part of the kinetic energy that the forces at the start may change up to there, if the residual
+counts as zero: such a motion is followed as a whole, or not at all."""
 FIRST_PART = 0.1
 """First step after a motion that starts in a layer, over the time in which it leaves that."""
 SHORTENED = 0.5
@@ -259,6 +264,8 @@ class PlaceOnCurve:
         beta at which the passage began; it ends at -start.
     beta, energy
         beta and the kinetic energy (J) where it stopped.
+    beside
+        Whether the state there is only next to the curve, in a layer that counts as none.
     """
 
     critical: CriticalConfiguration
@@ -267,6 +274,7 @@ class PlaceOnCurve:
     start: float
     beta: float
     energy: float
+    beside: bool = False
 
     def __deepcopy__(self, memo: Any) -> PlaceOnCurve:
         """Itself: nothing of it changes."""
@@ -338,18 +346,25 @@ class PassageAlongCurve:
         else:
             curve, self._start, beta = begun.curve, begun.start, begun.beta
             self._curve = curve
+        self._heading = -float(np.sign(self._start))
+        self._found: list[tuple[Node, float, float]] = []
         known = begun is not None and self._rounded(beta)
+        if begun is not None and begun.beside:
+            geometry.closure(place)
+            place, rates, _ = self._predicted(beta, begun.energy, geometry.mass())
         here = self._evaluated(place, beta, rates, self.t, self._closes(beta), known)
         if begun is None and not float(rates @ here.tangent) * beta < 0.0:
             raise ValueError("the motion leads away from the critical configuration")
-        self._heading = -float(np.sign(self._start))
         self._width = curve.width or abs(self._start)
         if begun is None:
             speed = float(curve.along @ rates) / float(curve.along @ here.tangent)
             self._energy = 0.5 * here.inertia * speed**2
         else:
             self._energy = begun.energy
-        self._clock, self._found = self.t, [(here, self._energy, self.t)]
+        self._clock = self.t
+        if self._driven and begun is not None and begun.beside:
+            self._clock = float(here.place[-1])
+        self._found.append((here, self._energy, self.t))
         self._count = node_count(self.rtol)
         reach = float(np.arcsinh(abs(self._start) / self._width))
         allowed = PANEL_ERROR * self.rtol
@@ -388,7 +403,10 @@ class PassageAlongCurve:
                 at, target = self._panel(at, target), edge
             except ValueError:
                 beyond, before = at >= LAYER, target <= -LAYER
+                bounded = self._bounded(at, target)
                 target = at + SHORTENED * (target - at)
+                if bounded:
+                    continue
                 if self.exact or not (beyond or before):
                     raise
                 if target - at < SHORTEST_PANEL:
@@ -396,6 +414,11 @@ class PassageAlongCurve:
                         raise
                     break
         return at
+
+    def _bounded(self, a: float, b: float) -> bool:
+        """Whether the energy of a straight motion may change by a part only on the panel from
+        ``a`` to ``b``: the shortest ones follow it as well as they can."""
+        return self.exact and not self._driven and b - a > SHORTEST_PANEL
 
     def _closes(self, beta: float) -> bool:
         """Whether the closures are to hold at ``beta``, also where their residual counts as
@@ -556,6 +579,8 @@ class PassageAlongCurve:
         if not (self._driven or self.exact):
             least = LEAST_ENERGY * self._energy if a >= LAYER else 0.0
             most = self._energy / LEAST_ENERGY if b <= -LAYER else np.inf
+        elif self._bounded(a, b):
+            least, most = LEAST_ENERGY * self._energy, self._energy / LEAST_ENERGY
         while True:
             xi = self._heading * (a + (b - a) * x)
             slope = self._width * np.cosh(xi) * self._heading * (b - a)
@@ -606,7 +631,7 @@ class PassageAlongCurve:
         if self._driven:  # known without any integral
             t = np.array([node.place[-1] for node in nodes])
         new = list(zip(nodes, energy.tolist(), t.tolist()))
-        self._found += [one for one in new if one[-1] < self.end]
+        self._found += [one for one in new if self.t < one[-1] < self.end]
         if self._clock >= self.end:
             # The end of the run, or of its smooth interval, lies in the panel.
             clock = np.concatenate([[begin], times])
@@ -727,12 +752,13 @@ def step_from_layer(mechanism: MechanismData, state: FloatArray) -> float:
 def layer_motion(
     system: BranchSystem, t: float, state: FloatArray, tolerance: float, reach: float
 ) -> PlaceOnCurve | None:
-    """The motion from ``state`` (nx,) at ``t`` (s) in the layer of a critical configuration with a
-    residual above ``tolerance`` (row units), to be followed along the curve up to the distance
-    ``reach`` (units) from that; None if there is none.
+    """The motion from ``state`` (nx,) at ``t`` (s) in the layer of a critical configuration, to be
+    followed along the curve up to the distance ``reach`` (units) from that; None if there is none,
+    or the residual is zero to rounding.
 
-    The energy is that of the rates as they are: rounding turns them by more than it changes their
-    size.
+    With a residual up to ``tolerance`` (row units) the curve is the branch along which the rates
+    lead.  The energy is that of the rates as they are: rounding turns them by more than it changes
+    their size.
     """
     analysis = system.singularities
     q, v = analysis.split(state)
@@ -740,20 +766,28 @@ def layer_motion(
     place, rates = geometry.at(q, t), geometry.rates(v)
     try:
         critical = critical_configuration(
-            geometry, analysis.rank, place, SEARCH, (), ROUNDED_RESIDUAL
+            geometry, analysis.rank, place, SEARCH, (), STEPPED_RESIDUAL
         )
-        if critical is None or not abs(critical.residual) > tolerance:
+        if critical is None or not abs(critical.residual) > STEPPED_RESIDUAL:
             return None
-        curve = CurveThroughSaddle(critical, place, False)
+        exact = not abs(critical.residual) > tolerance
+        curve = CurveThroughSaddle(critical, place, exact, rates if exact else None)
         geometry.closure(place)
+        along, own = float(curve.along @ rates), rates[: len(v)]
+        energy = 0.5 * float(own @ geometry.mass() @ own)
+        if exact and not geometry.drives:
+            tangent = curve.hyperbola(curve.beta)[1] * geometry.coordinate_unit
+            power = abs(float(tangent @ system.working_force(t, q, v)))
+            if power * reach > SPENT_ENERGY * energy:
+                reach = SPENT_ENERGY * energy / power
+            if not reach > LAYERS_LEFT * curve.layer:
+                return None
     except (ValueError, EvaluationError, np.linalg.LinAlgError):
         return None
-    along, own = float(curve.along @ rates), rates[: len(v)]
-    if along == 0.0 or not max(abs(curve.beta), curve.width) < reach:
+    if along == 0.0 or not max(abs(curve.beta), curve.layer) < reach:
         return None
-    energy = 0.5 * float(own @ geometry.mass() @ own)
     begin = -float(np.sign(along)) * reach
-    return PlaceOnCurve(critical, False, curve, begin, curve.beta, energy)
+    return PlaceOnCurve(critical, exact, curve, begin, curve.beta, energy, exact)
 
 
 def leads_to_dead_point(critical: CriticalConfiguration, place: FloatArray) -> bool:
@@ -848,21 +882,41 @@ class CriticalPassages:
             self._rest = layer_motion(self._system, t, state, self._tolerance, START_REACH)
         return self.under_way
 
-    def crossing(self, result: StepResult) -> float | None:
-        """When (s) the step of ``result`` passes a singular configuration that has not been
-        examined; None if it does not."""
+    def crossing(self, state: FloatArray, result: StepResult) -> float | None:
+        """When (s) the step of ``result`` from ``state`` (nx,) passes a singular configuration that
+        has not been examined; None if it does not."""
         self._unresolved = None
         # A step across the middle of a passage may be quiet: sigma is the same at both ends.
         if self._known:
             return None
         lowest = int(np.argmin(result.sigmas))
-        if lowest == 0 or not may_cross(result):
+        if not may_cross(result):
             return None
+        if lowest == 0:
+            # No step before the first one has seen sigma fall, and all its stages may lie beyond.
+            first = np.isinf(self._sigma) and self._one_freedom
+            return self._approached(state, result) if first else None
         abscissae = self._scheme.member(result.stiff).abscissae
         zero = zero_within(abscissae, result.sigmas)
         if zero is None or not 0.0 < zero <= 1.0:
             zero = float(abscissae[lowest])
         return float(result.t + zero * result.h)
+
+    def _approached(self, state: FloatArray, result: StepResult) -> float | None:
+        """When (s) the motion from ``state`` (nx,) comes to the critical configuration next to it;
+        None if that is not within the step of ``result``."""
+        analysis = self._system.singularities
+        q, v = analysis.split(state)
+        geometry = analysis.geometry(analysis.q0, result.t)
+        place = geometry.at(q, result.t)
+        critical = critical_configuration(
+            geometry, analysis.rank, place, SEARCH, self._found, STEPPED_RESIDUAL
+        )
+        if critical is None:
+            return None
+        away, rates = geometry.difference(place, critical.q)[: len(v)], geometry.rates(v)[: len(v)]
+        ahead = float(away @ rates / (rates @ rates))
+        return result.t + ahead if 0.0 < ahead < result.h else None
 
     def unexamined(self, zero: float | None, t: float) -> float | None:
         """The ``zero`` (s) of sigma that is expected after ``t`` (s), unless it was examined."""
@@ -906,7 +960,7 @@ class CriticalPassages:
             if not float(before @ after) < 0.0:
                 return StepBeside.UNKNOWN
             critical = critical_configuration(
-                geometry, analysis.rank, begin, SEARCH, self._found, ROUNDED_RESIDUAL
+                geometry, analysis.rank, begin, SEARCH, self._found, STEPPED_RESIDUAL
             )
             if critical is not None and not self._avoids(critical):
                 critical = None
@@ -959,7 +1013,7 @@ class CriticalPassages:
         geometry = analysis.geometry(analysis.q0, t)
         place = geometry.at(q, zero)
         critical = critical_configuration(
-            geometry, analysis.rank, place, SEARCH, self._found, ROUNDED_RESIDUAL
+            geometry, analysis.rank, place, SEARCH, self._found, STEPPED_RESIDUAL
         )
         self._avoided = None
         if critical is None:
@@ -968,10 +1022,10 @@ class CriticalPassages:
         left, covered = (geometry.difference(critical.q, x) for x in (place, begin))
         self._known = bool(np.linalg.norm(left) < PASSED * np.linalg.norm(covered))
         residual = critical.residual
-        if abs(residual) > ROUNDED_RESIDUAL and expected and np.linalg.norm(covered) > FARTHEST:
+        if abs(residual) > STEPPED_RESIDUAL and expected and np.linalg.norm(covered) > FARTHEST:
             self._known = False
             return []
-        if abs(residual) <= ROUNDED_RESIDUAL:
+        if abs(residual) <= STEPPED_RESIDUAL:
             # Steps pass it in any turn.  A passage along a curve depends on where a search begins,
             # and whether it ends: it has one of its own.
             if self._one_freedom and not geometry.drives and critical.geometry is geometry:
@@ -979,17 +1033,15 @@ class CriticalPassages:
             return []
         avoided, steps_pass = self._avoids(critical), False
         steps: list[tuple[StepResult, float]] = []
-        disturbs = abs(residual) > DISTURBING * self._norm.rtol
-        if avoided or disturbs or end < zero + ahead:
-            try:
-                passage = PassageAlongCurve(
-                    system, critical, t, state, end, not avoided, self._norm.rtol
-                )
-                steps = self._along(passage)
-            except (ValueError, EvaluationError, np.linalg.LinAlgError):
-                # Steps pass it as well as they can, and the message says so.  A motion that has
-                # still to turn back is examined again.
-                steps_pass = self._one_freedom
+        try:
+            passage = PassageAlongCurve(
+                system, critical, t, state, end, not avoided, self._norm.rtol
+            )
+            steps = self._along(passage)
+        except (ValueError, EvaluationError, np.linalg.LinAlgError):
+            # Steps pass it as well as they can, and the message says so.  A motion that has
+            # still to turn back is examined again.
+            steps_pass = self._one_freedom
         found = ExaminedPassage(zero, residual, avoided, bool(steps))
         if self._known and steps_pass and not expected:
             self._unresolved = found
@@ -1076,7 +1128,8 @@ class CriticalPassages:
 
     def message(self) -> str:
         """Sentences on the passages that the tolerance decided, or that could not be resolved."""
-        by_tolerance = [abs(one.residual) for one in self.examined if not one.avoided]
+        residuals = [abs(one.residual) for one in self.examined if not one.avoided]
+        by_tolerance = [residual for residual in residuals if residual > ROUNDED_RESIDUAL]
         unresolved = [one for one in self.examined if one.avoided and not one.resolved]
         missed = [one for one in unresolved if abs(one.residual) < WIDE]
         out = ""

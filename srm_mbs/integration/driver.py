@@ -461,7 +461,7 @@ def integrate(
                 result = None
                 unevaluated = RunFailure(StopReason.NOT_EVALUATED, str(error))
             if result is not None and pass_critical(
-                None if passages is None else passages.crossing(result), False
+                None if passages is None else passages.crossing(x, result), False
             ):
                 continue
             if (

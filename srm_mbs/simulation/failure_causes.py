@@ -8,6 +8,7 @@ A run fails where its steps fail, and says so; these causes come first in its me
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -23,6 +24,7 @@ from srm_mbs.dynamics.scaling import (
     rotating_coordinates,
     start_rounding,
 )
+from srm_mbs.dynamics.singularities.critical import CurveThroughSaddle, critical_configuration
 from srm_mbs.errors import ControllerError, joined_names, safe_repr
 from srm_mbs.integration.messages import FailureCause
 from srm_mbs.model.coordinates import free_coordinates, joint_coordinates, position_of
@@ -38,6 +40,9 @@ RUNAWAY = 100.0
 NEAR_DEAD_POINT = 0.05
 """Part of a driven coordinate in the motion of its mechanism, below which it is next to its dead
 point; and its largest distance from there, in its unit."""
+NARROW_LAYER = 1e-3
+"""Width (units) of the layer of a critical configuration up to which the dead point of a drive in
+it is that of the hyperbola; in wider ones differences show it."""
 NEWTON_STEPS = 20
 SLOPE_STEP = 1e-4
 """Step of the difference for the second derivative of a coordinate along the motion."""
@@ -174,9 +179,9 @@ def dead_point(mechanism: Mechanism, t: float, q: FloatArray) -> FailureCause | 
         return abs(rates[drive.name] / float(unit[_coordinate_of(mechanism, drive)]))
 
     for drive in sorted(drives, key=speed, reverse=True):
-        found = _dead_point_of(mechanism, drive, q, rates[drive.name])
-        if found is not None:
-            return found
+        turn = _turn_in_layer(mechanism, drive, q) or _turn_of(mechanism, drive, q)
+        if turn is not None and rates[drive.name] * turn[1] < 0.0:  # not beyond the dead point
+            return _at_dead_point(mechanism, drive, q, *turn)
     return None
 
 
@@ -184,13 +189,34 @@ def _coordinate_of(mechanism: Mechanism, drive: Drive) -> int:
     return int(joint_coordinates(mechanism, [str(drive.joint)])[0])
 
 
-def _dead_point_of(
-    mechanism: Mechanism, drive: Drive, q: FloatArray, rate: float
-) -> FailureCause | None:
+def _turn_in_layer(mechanism: Mechanism, drive: Drive, q: FloatArray) -> tuple[float, float] | None:
+    """As :func:`_turn_of`, in the layer of a critical configuration; None if there is none, it is
+    wide, or the drive is not the only one of a mechanism with one degree of freedom."""
+    idle = replace(mechanism, drives=())
+    geometry, own = ClosureGeometry(idle, q), _coordinate_of(mechanism, drive)
+    rank = idle.structure.rank
+    if len(mechanism.drives) > 1 or len(geometry.unit) - rank != 1:
+        return None
+    try:
+        critical = critical_configuration(geometry, rank, q, NEAR_DEAD_POINT)
+        if critical is None:
+            return None
+        curve = CurveThroughSaddle(critical, q, False)
+    except (ValueError, np.linalg.LinAlgError):
+        return None
+    turn = curve.turn_of(own) if curve.width < NARROW_LAYER else None
+    if turn is None:
+        return None
+    to_turn = curve.hyperbola(turn[0])[0] - geometry.difference(critical.q, q)
+    return float(to_turn[own]), turn[1]
+
+
+def _turn_of(mechanism: Mechanism, drive: Drive, q: FloatArray) -> tuple[float, float] | None:
+    """How far the driven coordinate is from where it turns back (units), and its second derivative
+    along the motion there; None if it does not, or that is far away."""
     geometry = ClosureGeometry(mechanism, q)
     others = [other.joint for other in mechanism.drives if other.joint and other is not drive]
     free = free_coordinates(mechanism, others)
-    name = str(drive.joint)
     own = _coordinate_of(mechanism, drive)
     basis, _ = tangent_basis(geometry, q, free)
     size = basis.shape[1]
@@ -217,13 +243,20 @@ def _dead_point_of(
         return None
     bends = np.linalg.eigvalsh(0.5 * (hessian + hessian.T))
     bend = bends[np.argmax(np.abs(bends))]
-    # Neither a saddle, from where the joint goes on, nor beyond the dead point.
-    if bend == 0.0 or (bends / bend < -IDLE).any() or rate * bend >= 0.0:
+    # No saddle, from where the joint goes on.
+    if bend == 0.0 or (bends / bend < -IDLE).any() or abs(point.u[own]) > NEAR_DEAD_POINT:
         return None
-    if abs(point.u[own]) > NEAR_DEAD_POINT:
-        return None
+    return float(point.u[own]), float(bend)
+
+
+def _at_dead_point(
+    mechanism: Mechanism, drive: Drive, q: FloatArray, distance: float, bend: float
+) -> FailureCause:
+    """The cause that :func:`_turn_of` found, of a drive that leads there."""
+    name = str(drive.joint)
     here = position_of(mechanism, q, name)
-    limit = here + float(point.u[own] * geometry.unit[own])
+    length = float(mechanism.structure.units.coordinate[_coordinate_of(mechanism, drive)])
+    limit = here + distance * length
     unit = "rad" if is_angle(mechanism.model, name) else "m"
     most = "most" if bend < 0.0 else "least"
     return FailureCause(

@@ -85,6 +85,26 @@ def test_a_first_step_across_the_middle_of_a_layer_sees_it(
     assert reference.error(solution) < 3.0 * rtol
 
 
+@on_both
+@pytest.mark.parametrize(
+    ("d", "rtol", "turns", "before"),
+    [(1e-10, 1e-2, 1, 5.6e-3), (1e-10, 1e-2, 9, 4.6e-3), (-1e-10, 1e-2, 5, 6.3e-3)],
+)
+def test_a_first_step_whose_stages_all_lie_beyond_a_layer_sees_it(
+    d: float, rtol: float, turns: int, before: float, backend: str
+) -> None:
+    mechanism, reference = slider_crank(d), Reference(d)
+    corner = (0.5 + turns) * np.pi
+    t = reference.time(reference.sign * corner) - before
+    ends = (reference.sign * (corner - x) for x in (1.0, 0.0))
+    q, v = state_at(reference, brentq(lambda angle: reference.time(angle) - t, *ends))
+    solution = srm.simulate(
+        mechanism, t + 0.5, t0=t, q0=q, v0=v, rtol=rtol, backend=backend, **EXACT
+    )
+    assert solution.success, solution.message
+    assert reference.error(solution) < 10.0 * rtol
+
+
 @pytest.mark.stress
 @needs_kernel
 @pytest.mark.parametrize("d", OFFSETS)

@@ -84,6 +84,8 @@ def test_a_four_bar_meets_its_change_points_several_times() -> None:
         ("folded", -1e-11, 1e-4, 2.0 * np.pi),
         ("parallelogram", -5e-11, 1e-4, np.pi),
         ("parallelogram", -1e-7, 1e-6, np.pi),
+        ("folded", -1e-9, 1e-6, 2.0 * np.pi),
+        ("folded", -1e-10, 1e-8, 2.0 * np.pi),
     ],
 )
 def test_a_driven_crank_stops_at_its_dead_point_in_a_layer(
@@ -96,3 +98,4 @@ def test_a_driven_crank_stops_at_its_dead_point_in_a_layer(
         run = srm.simulate(mechanism, 2.0, rtol=rtol, singular_tolerance=0.0, backend=backend)
     assert run.q[-1, 0] == pytest.approx(end, abs=2.0 * np.sqrt(abs(d)))
     assert run.message.startswith("Stopped")
+    assert "the drive 'crank' is at its dead point" in run.message

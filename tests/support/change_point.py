@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from scipy.integrate import solve_ivp
 
 import srm_mbs as srm
 from tests.support.mechanisms import add_link, along_x, rod
@@ -184,3 +185,47 @@ class AlmostChangePoint:
 
 CHANGE_POINTS = {"folded": (1.0, 2.0, 2.5, 1.5), "parallelogram": (1.0, 2.0, 1.0, 2.0)}
 """Lengths of crank, coupler, rocker and ground: one and two change points a turn."""
+
+
+@dataclass(frozen=True)
+class StraightOn(AlmostChangePoint):
+    """The motion of the four-bar with d = 0 straight through the change point at theta = 0, where
+    sin(phi/2) = ``side`` sqrt(a g/(b c)) sin(theta/2); p is theta, from -pi to pi."""
+
+    d: float = 0.0
+    side: float = 1.0
+
+    def half_angles(self, p: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+        (ag, bc), (_, lam) = self.products, self.levels
+        st, ct = np.sin(0.5 * p), np.cos(0.5 * p)
+        sf = self.side * np.sqrt(ag / bc) * st
+        cf = np.sqrt((lam + ag * ct**2) / bc)
+        return st, ct, sf, cf, np.ones_like(st), self.side * np.sqrt(ag / bc) * ct / cf
+
+    def joints(self, p: float, rate: float) -> tuple[Any, Any]:
+        """q and v at theta = p and its rate."""
+        angles, slopes = self.motion(np.array(p))
+        q, v = (np.array([x[0], x[1] - x[0], x[2]]) for x in (angles, slopes))
+        return q, rate * v
+
+    def after(self, p: float, kinetic: float, heading: float, t: float) -> tuple[Any, Any]:
+        """q and v a time ``t`` (s) after theta = p, with that kinetic energy and sign of theta'."""
+        energy = kinetic + float(self.energies(np.array(p))[1])
+
+        def field(_: float, y: Any) -> Any:
+            inertia, potential = self.energies(y)
+            return heading * np.sqrt(2.0 * (energy - potential) / inertia)
+
+        run = solve_ivp(field, (0.0, t), [p], method="DOP853", rtol=1e-12, atol=1e-13)
+        return self.joints(float(run.y[0, -1]), float(field(t, run.y[:, -1])[0]))
+
+    @classmethod
+    def of(cls, name: str, q: Any) -> StraightOn:
+        """That of :data:`CHANGE_POINTS` whose branch is the nearer one at q."""
+        theta, phi = turned(q[0]), turned(q[2] - q[0] - q[1])
+        return cls(*CHANGE_POINTS[name], side=float(np.sign(theta * phi)))
+
+
+def turned(angle: Any) -> Any:
+    """The angle but for whole turns, between -pi and pi."""
+    return np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi

@@ -127,11 +127,12 @@ namespace srm {
     field(double, dead_point_width)        /* of a layer, at most */                               \
     field(double, dead_point_widths)       /* at which the curve is earlier than in the middle */  \
     field(double, rounded_residual)        /* that of a singular configuration (row units) */      \
+    field(double, stepped_residual)        /* that up to which steps pass it */                    \
     field(double, examined_again)          /* fall of sigma after a search without a passage */    \
-    field(double, disturbing)              /* one that counts as zero and disturbs, over rtol */   \
     field(double, dependent_row)           /* remainder of a row that depends on others */         \
     field(double, definite)                /* ratio of the curvatures of a saddle, at least */     \
     field(double, largest_deviation)       /* from the hyperbola, over the distance */             \
+    field(double, straight)                /* deviation of a slope from that of a branch */        \
     field(double, layer)                   /* |xi| of the panel in the middle */                   \
     field(double, shortest_panel)          /* in xi */                                             \
     field(double, panel_error)             /* of interpolation (units), over rtol */               \
@@ -146,6 +147,8 @@ namespace srm {
     field(int, placing_steps)              /* onto the curve, before an evaluation there */        \
     field(double, converging)              /* ratio of such steps up to which they are made */     \
     field(double, passage_turned)          /* last relative change of rates, over rtol */          \
+    field(double, spent_energy)            /* that forces may change in a start, of the kinetic */ \
+    field(double, layers_left)             /* reach of such a start, over the layer, at least */   \
     field(double, place_rounding)          /* of a place (units^2), times its distance */          \
     field(double, extrapolated)            /* |beta| from which the deviation is known */          \
     field(double, panel_cut)               /* length of a panel that ends in a stop */             \

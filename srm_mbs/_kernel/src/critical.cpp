@@ -329,7 +329,7 @@ std::optional<CriticalConfiguration> critical_of_passage(UnitClosures& closures,
     };
     const double covered = distance(std::vector<double>(begin, begin + nx));
     found.passed = distance(place) < constants.critical_passed * covered;
-    const bool singular = !(std::abs(found.residual) > constants.rounded_residual);
+    const bool singular = !(std::abs(found.residual) > constants.stepped_residual);
     if (!singular && !search.complete()) return {};
     return std::move(found);
 }

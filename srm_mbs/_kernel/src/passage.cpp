@@ -50,8 +50,9 @@ void extend(Vector& basis, int n, int more) {
 // The curve of closed configurations beside a critical one: CurveThroughSaddle.
 class SaddleCurve {
 public:
+    // `rates` (n,), in units: those of a motion that starts in a layer whose residual counts as zero.
     SaddleCurve(UnitClosures& closures, const MotionAlongCurve& motion, const Vector& x, double t,
-                const Constants& constants)
+                const Constants& constants, const Vector* rates = nullptr)
         : closures_(closures),
           critical_(motion.critical),
           n_(closures.n),
@@ -114,10 +115,23 @@ public:
         beta = dot(along.data(), away.data(), n_);
         const double beside = dot(kept_.data(), away.data(), n_);
         side = (exact_ ? beside * beta : beside) > 0.0 ? 1 : -1;
-        hyperbola(beta, on, slope);
         const double distance = norm(away.data(), n_);
+        double nearest = 0.0;
+        if (rates) {
+            // On each level of the residual beta and the other coordinate grow at rates in the ratio
+            // in which they are, but for the curvatures: the rates know the branch at q*, too.
+            const double ahead = dot(along.data(), rates->data(), n_);
+            if (ahead == 0.0) throw NoPassage{};
+            const double rise = dot(kept_.data(), rates->data(), n_) / ahead;
+            side = rise > 0.0 ? 1 : -1;
+            nearest = layer * std::sqrt(ratio_);  // of the hyperbola
+            const bool straight = std::abs(std::abs(rise) / std::sqrt(ratio_) - 1.0) <
+                                  constants.straight + nearest;
+            if (distance < largest_deviation_ * nearest && !straight) throw NoPassage{};
+        }
+        hyperbola(beta, on, slope);
         add(-1.0, on.data(), away.data(), n_);
-        if (!(norm(away.data(), n_) < largest_deviation_ * distance)) throw NoPassage{};
+        if (!(norm(away.data(), n_) < largest_deviation_ * distance + nearest)) throw NoPassage{};
     }
 
     // The sign of the kept coordinate of a place, at beta; 0 if the hyperbola does not tell it.
@@ -134,7 +148,8 @@ public:
 
     // The point of the hyperbola at `at`, as a displacement from q*, and its derivative.
     void hyperbola(double at, Vector& away, Vector& slope) const {
-        double kept = std::sqrt(level_ + ratio_ * at * at), rise = ratio_ * at / kept;
+        double kept = std::sqrt(level_ + ratio_ * at * at);
+        double rise = kept > 0.0 ? ratio_ * at / kept : std::sqrt(ratio_);
         const double sign = exact_ && at < 0.0 ? -side : side;
         kept *= sign;
         rise *= sign;
@@ -244,6 +259,7 @@ public:
           driven_(system_.driven()),
           rtol_(rtol),
           end_(end),
+          begin_(state),
           curve_(closures, motion, state, t, constants) {
         Vector rates(n_);
         for (int j = 0; j < nv_; ++j) rates[j] = state[nq_ + j] / closures.unit(j);
@@ -251,23 +267,35 @@ public:
         const bool begun = motion.begun;
         const double beta = curve_.beta, start = begun ? motion.start : beta;
         motion.start = start;
-        Node here = evaluated(state, t, beta, rates, closes(beta), begun && rounded(beta));
+        heading_ = start > 0.0 ? -1.0 : 1.0;
+        const bool beside = begun && motion.beside;
+        Node here;
         here.x = state;
         here.time = t;
+        here.rates = rates;
+        if (beside) {
+            system_.evaluate(t, state.data(), System::ZoneView{});  // for the mass matrix
+            double rate;
+            here = predicted(beta, motion.energy, rate);
+        }
+        here = evaluated(here.x, here.time, beta, here.rates, closes(beta), begun && rounded(beta));
+        clock_ = beside && driven_ ? here.time : t;
+        if (!beside) {
+            here.x = state;
+            here.time = t;
+        }
         if (!begun && !(dot(rates.data(), here.tangent.data(), n_) * start < 0.0))
             throw NoPassage{};
-        heading_ = start > 0.0 ? -1.0 : 1.0;
         width_ = curve_.width > 0.0 ? curve_.width : std::abs(start);
         const double speed = dot(curve_.along.data(), rates.data(), n_) /
                              dot(curve_.along.data(), here.tangent.data(), n_);
         energy_ = begun ? motion.energy : 0.5 * here.inertia * speed * speed;
-        clock_ = t;
         found_.push_back({std::move(here), energy_, t});
         const double reach = std::asinh(std::abs(start) / width_);
         const Vector edges = panel_edges(reach, !motion.exact);
         double at = begun ? heading_ * std::asinh(beta / width_) : edges.front();
         motion.side = curve_.side;
-        motion.begun = false;
+        motion.begun = motion.beside = false;
         for (std::size_t k = 1; k < edges.size() && !(at < edges[k - 1]); ++k)
             at = panels(at, edges[k]);
         if (clock_ < end_) {
@@ -281,7 +309,9 @@ public:
         std::vector<PassagePoint> out;
         for (const Found& one : found_) {
             PassagePoint p{one.t, one.node.sigma, one.node.x, Vector(2 * nv_)};
-            if (!out.empty()) {
+            if (out.empty()) {
+                p.state = begin_;
+            } else {
                 const double rate = speed(one.node, one.energy);
                 for (int j = 0; j < nv_; ++j)
                     p.state[nq_ + j] = rate * one.node.tangent[j] * closures_.unit(j);
@@ -501,6 +531,12 @@ private:
         }
     }
 
+    // Whether the energy of a straight motion may change by a part only on the panel from a to b: the
+    // shortest ones follow it as well as they can.
+    bool bounded(double a, double b) const {
+        return motion_.exact && !driven_ && b - a > constants_.shortest_panel;
+    }
+
     // Goes on from `at` to the edge, of xi times the heading; returns where that led.  Beyond the
     // layer that may be less, where the motion turns back soon.  Where the energy changes much, panels
     // are shorter.
@@ -512,7 +548,9 @@ private:
                 target = edge;
             } catch (const NoPassage&) {
                 const bool beyond = at >= constants_.layer, before = target <= -constants_.layer;
+                const bool is_bounded = bounded(at, target);
                 target = at + constants_.panel_shortened * (target - at);
+                if (is_bounded) continue;
                 if (motion_.exact || !(beyond || before)) throw;
                 if (target - at < constants_.shortest_panel) {
                     if (before) throw;
@@ -538,6 +576,9 @@ private:
         if (!(driven_ || motion_.exact)) {
             if (a >= constants_.layer) least = constants_.least_energy * energy_;
             if (b <= -constants_.layer) most = energy_ / constants_.least_energy;
+        } else if (bounded(a, b)) {
+            least = constants_.least_energy * energy_;
+            most = energy_ / constants_.least_energy;
         }
         const auto with_start = [](double first, const Vector& values) {
             Vector out{first};
@@ -602,7 +643,8 @@ private:
         }
         for (int i = 0; i < count_; ++i) {
             const double time = driven_ ? nodes[i].time : times[i];
-            if (time < end_) found_.push_back({std::move(nodes[i]), energies[i], time});
+            if (found_.front().t < time && time < end_)
+                found_.push_back({std::move(nodes[i]), energies[i], time});
         }
         if (!ends) return b;
         if (rounded(motion_.beta))
@@ -737,6 +779,7 @@ private:
     const int count_, nq_, nv_, n_;
     const bool driven_;
     const double rtol_, end_;
+    const Vector begin_;  // the state there
     SaddleCurve curve_;
     double heading_ = 1.0, width_ = 1.0, energy_ = 0.0, clock_ = 0.0;
     std::vector<Found> found_;
@@ -767,20 +810,33 @@ std::optional<MotionAlongCurve> motion_in_layer(System& system, double t,
     try {
         const std::vector<double> still(2 * nv, 0.0);
         auto critical = critical_of_passage(closures, t, state.data(), still.data(), t, constants);
-        if (!critical ||
-            !(std::abs(critical->residual) > std::max(tolerance, constants.rounded_residual)))
-            return {};
-        MotionAlongCurve motion{std::move(*critical), time_unit, false};
-        const SaddleCurve curve(closures, motion, state, t, constants);
-        double along = system.driven() ? curve.along[nv] / time_unit : 0.0;
-        for (int j = 0; j < nv; ++j) along += curve.along[j] * state[system.nq + j] / closures.unit(j);
-        if (along == 0.0 || !(std::max(std::abs(curve.beta), curve.width) < reach)) return {};
+        if (!critical || !(std::abs(critical->residual) > constants.stepped_residual)) return {};
+        const bool exact = !(std::abs(critical->residual) >
+                             std::max(tolerance, constants.rounded_residual));
+        MotionAlongCurve motion{std::move(*critical), time_unit, exact};
+        std::vector<double> rates(closures.n);
+        for (int j = 0; j < nv; ++j) rates[j] = state[system.nq + j] / closures.unit(j);
+        if (system.driven()) rates[nv] = 1.0 / time_unit;
+        const SaddleCurve curve(closures, motion, state, t, constants, exact ? &rates : nullptr);
+        const double along = dot(curve.along.data(), rates.data(), closures.n);
         // Of the rates as they are: rounding turns them by more than it changes their size.
         system.evaluate(t, state.data(), System::ZoneView{});
         std::vector<double> momentum(nv);
         system.mass_times(&state[system.nq], momentum.data());
         motion.energy = 0.5 * dot(&state[system.nq], momentum.data(), nv);
+        if (exact && !system.driven()) {
+            Vector away(nv), tangent(nv), all(nv), working(nv);
+            curve.hyperbola(curve.beta, away, tangent);
+            system.working_forces(all.data(), working.data());
+            double power = 0.0;
+            for (int j = 0; j < nv; ++j) power += tangent[j] * closures.unit(j) * working[j];
+            const double spent = constants.spent_energy * motion.energy;
+            if (std::abs(power) * reach > spent) reach = spent / std::abs(power);
+            if (!(reach > constants.layers_left * curve.layer)) return {};
+        }
+        if (along == 0.0 || !(std::max(std::abs(curve.beta), curve.layer) < reach)) return {};
         motion.begun = true;
+        motion.beside = exact;
         motion.side = curve.side;
         motion.beta = curve.beta;
         motion.start = along > 0.0 ? -reach : reach;

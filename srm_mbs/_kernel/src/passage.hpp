@@ -36,6 +36,7 @@ struct MotionAlongCurve {
     bool begun = false;  // the other fields are known
     int side = 0;        // of the branches
     double start = 0.0, beta = 0.0, energy = 0.0;
+    bool beside = false;  // the state is only next to the curve, in a layer that counts as none
 };
 
 // The points of the motion from `state` at t past the critical configuration, along the curve of
@@ -47,8 +48,8 @@ std::vector<PassagePoint> passage_along_curve(System& system, MotionAlongCurve& 
                                               double rtol, const Collocation& collocation,
                                               const Constants& constants);
 
-// The motion that starts at t in the layer of a critical configuration with a residual above
-// `tolerance`, to be followed up to the distance `reach` from it: layer_motion() of
+// The motion that starts at t in the layer of a critical configuration, to be followed up to the
+// distance `reach` from it; a residual up to `tolerance` counts as zero.  layer_motion() of
 // integration/critical_passages.py.
 std::optional<MotionAlongCurve> motion_in_layer(System& system, double t,
                                                 const std::vector<double>& state, double time_unit,

@@ -227,6 +227,7 @@ RunSnapshot Run::snapshot() const {
     control->save(out.control);
     out.open_residual = open_residual_;
     out.search_below = search_below_;
+    out.first = first_;
     out.known = known_;
     out.quiet = quiet_;
     out.examine_below = examine_below_;
@@ -240,6 +241,7 @@ void Run::restore(const RunSnapshot& snapshot) {
     resume(snapshot.t, snapshot.state, snapshot.memory, snapshot.control);
     open_residual_ = snapshot.open_residual;
     search_below_ = snapshot.search_below;
+    first_ = snapshot.first;
     known_ = snapshot.known;
     quiet_ = snapshot.quiet;
     examine_below_ = snapshot.examine_below;
@@ -365,16 +367,40 @@ bool Run::misses_jump(const Proposal& proposal, const StepResult& r) {
 }
 
 // When the step passes a singular configuration that has not been examined.
-std::optional<double> Run::crossing(const StepResult& r) const {
+std::optional<double> Run::crossing(const StepResult& r) {
     // A step across the middle of a passage may be quiet: sigma is the same at both ends.
     if (known_) return {};
     const auto [low, high] = std::minmax_element(r.sigmas.begin(), r.sigmas.end());
-    if (low == r.sigmas.begin() || !(2.0 * *low < *high)) return {};
+    if (!(2.0 * *low < *high)) return {};
+    // No step before the first one has seen sigma fall, and all its stages may lie beyond.
+    if (low == r.sigmas.begin()) {
+        if (!first_ || !one_freedom_) return {};
+        return approached(r);
+    }
     std::vector<double> abscissae(made_by_->scheme.c);
     abscissae.push_back(1.0);
     const double zero = zero_within(abscissae, r.sigmas);
     const bool inside = 0.0 < zero && zero <= 1.0;
     return r.t + (inside ? zero : abscissae[low - r.sigmas.begin()]) * r.h;
+}
+
+// When the motion comes to the critical configuration next to it, if that is within the step.
+std::optional<double> Run::approached(const StepResult& r) {
+    UnitClosures closures(system, r.h);
+    const auto critical = critical_of_passage(closures, t_, state.data(), memory.rate.data(), t_,
+                                              constants());
+    if (!critical) return {};
+    std::vector<double> away(closures.n);
+    closures.difference(state, t_, critical->x, critical->t, away.data());
+    double along = 0.0, square = 0.0;
+    for (int j = 0; j < system.nv; ++j) {
+        const double rate = state[system.nq + j] / closures.unit(j);
+        along += away[j] * rate;
+        square += rate * rate;
+    }
+    const double ahead = along / square;
+    if (!(0.0 < ahead && ahead < r.h)) return {};
+    return r.t + ahead;
 }
 
 // CriticalPassages.beside in integration/critical_passages.py.
@@ -407,7 +433,6 @@ bool Run::avoids(const CriticalConfiguration& critical) const {
 // Examines the passage at `zero`, which is expected or lies in a step, and prepares the steps along
 // the curve if ordinary steps are not to make it; whether there are any.
 bool Run::examine(double zero, bool expected) {
-    const double rtol = step.norm.rtol;
     examine_below_ = constants().examined_again * memory.sigma;
     UnitClosures closures(system, zero - t_);
     const auto critical = critical_of_passage(closures, t_, state.data(), memory.rate.data(), zero,
@@ -416,7 +441,7 @@ bool Run::examine(double zero, bool expected) {
     avoided_.reset();
     if (!critical) return false;
     const double residual = std::abs(critical->residual);
-    if (!(residual > constants().rounded_residual)) return false;
+    if (!(residual > constants().stepped_residual)) return false;
     if (expected) {  // another one may lie between
         std::vector<double> covered(closures.n);
         closures.difference(critical->x, critical->t, state, t_, covered.data());
@@ -425,15 +450,10 @@ bool Run::examine(double zero, bool expected) {
             return false;
         }
     }
-    const bool avoided = residual > singular_tolerance_;
-    // Steps may pass a residual that is far below the tolerance, but not end beside it.
-    const bool disturbs = residual > constants().disturbing * rtol;
-    bool steps_pass = false;
-    if (avoided || disturbs || intervals_.ends[interval_] < zero + (zero - t_)) {
-        follow({*critical, closures.time_unit, !avoided});
-        // A motion that is still to turn back is examined again.
-        steps_pass = prepared_.empty() && one_freedom_;
-    }
+    const bool avoided = avoids(*critical);
+    follow({*critical, closures.time_unit, !avoided});
+    // A motion that is still to turn back is examined again.
+    const bool steps_pass = prepared_.empty() && one_freedom_;
     const ExaminedPassage found{zero, critical->residual, avoided, !prepared_.empty()};
     if (known_ && steps_pass && !expected) unresolved_ = found;
     known_ = (known_ && !steps_pass) || !prepared_.empty();
@@ -535,6 +555,7 @@ void Run::record(const StepResult& result, double t, int placement) {
     std::copy(result.state.begin(), result.state.end(), state.begin());
     made_by_->accept(memory);
     t_ = t;
+    first_ = false;
     if (made_++ % constants().standstill_steps == 0) watched_time_ = t_;
 }
 

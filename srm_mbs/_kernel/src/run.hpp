@@ -105,6 +105,7 @@ struct StepRecords {
     field(double, open_residual)                                                   \
     field(double, search_below)                                                    \
     /* Passages next to critical configurations: see Run. */                       \
+    field(bool, first)                                                             \
     field(bool, known)                                                             \
     field(bool, quiet)                                                             \
     field(double, examine_below)                                                   \
@@ -179,7 +180,8 @@ public:
 
 private:
     bool leaves_closures_open(const StepResult& result);
-    std::optional<double> crossing(const StepResult& result) const;
+    std::optional<double> crossing(const StepResult& result);
+    std::optional<double> approached(const StepResult& result);
     bool examine(double zero, bool expected);
     StepBeside beside(const StepResult& result);
     bool avoids(const CriticalConfiguration& critical) const;
@@ -224,6 +226,7 @@ private:
     double singular_tolerance_;
     const Collocation& collocation_;
     const bool one_freedom_;  // the closed configurations are curves, which may be followed
+    bool first_ = true;       // no step was made
     bool known_ = false;      // the passage ahead has been examined
     bool quiet_ = false;      // the last step was
     // sigma below which the motion is examined again, where no passage was found so far.

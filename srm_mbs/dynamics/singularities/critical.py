@@ -56,6 +56,9 @@ configuration: it is in proportion to the part that the drive has in u."""
 LARGEST_DEVIATION = 0.5
 """Distance of a configuration from its hyperbola, over that from the critical configuration, from
 which it is not beside that one."""
+STRAIGHT = 1e-3
+"""Largest deviation of the slope of rates from that of a branch, over it, at a critical
+configuration, besides the size of its layer."""
 DEFINITE = 1e-3
 """Ratio of the two curvatures of a saddle below which branches are almost tangent."""
 
@@ -325,6 +328,9 @@ class CurveThroughSaddle:
         A configuration on the curve, as the geometry takes it.
     exact
         Whether the residual counts as zero: the curve then leads straight through q*.
+    rates : (n,)
+        Of a motion from q anywhere in the layer of a residual that counts as zero, in units: the
+        curve is the branch along which they lead.
 
     Attributes
     ----------
@@ -343,7 +349,13 @@ class CurveThroughSaddle:
         If the critical configuration is no saddle, or q is not on a curve beside it.
     """
 
-    def __init__(self, critical: CriticalConfiguration, q: FloatArray, exact: bool) -> None:
+    def __init__(
+        self,
+        critical: CriticalConfiguration,
+        q: FloatArray,
+        exact: bool,
+        rates: FloatArray | None = None,
+    ) -> None:
         geometry = self._geometry = critical.geometry
         self._critical = critical
         rank, n = critical.rows.shape[0], len(geometry.unit)
@@ -371,19 +383,41 @@ class CurveThroughSaddle:
         self.beta = float(self.along @ away)
         beside = float(self._kept @ away)
         self._sign = float(np.sign(beside if not exact else beside * self.beta))
+        distance, nearest = float(np.linalg.norm(away)), 0.0
+        if rates is not None:
+            # On each level of the residual beta and the other coordinate grow at rates in the ratio
+            # in which they are, but for the curvatures: the rates know the branch at q*, too.
+            ahead, aside = float(self.along @ rates), float(self._kept @ rates)
+            if ahead == 0.0:
+                raise ValueError("the rates lead nowhere")
+            slope = aside / ahead
+            self._sign = float(np.sign(slope))
+            nearest = self.layer * float(np.sqrt(self._ratio))  # of the hyperbola
+            straight = abs(abs(slope) / np.sqrt(self._ratio) - 1.0) < STRAIGHT + nearest
+            if distance < LARGEST_DEVIATION * nearest and not straight:
+                raise ValueError("the rates do not lead along a branch")
         off = float(np.linalg.norm(away - self.hyperbola(self.beta)[0]))
-        if not off < LARGEST_DEVIATION * float(np.linalg.norm(away)):
+        if not off < LARGEST_DEVIATION * distance + nearest:
             raise ValueError("the configuration is not on a curve beside the critical one")
 
     def hyperbola(self, beta: float) -> tuple[FloatArray, FloatArray]:
         """The point of the hyperbola at ``beta``, as a displacement (n,) from q*, and its
         derivative."""
         kept = np.sqrt(self._level + self._ratio * beta * beta)
-        slope = self._ratio * beta / kept
-        if self._exact:
+        slope = self._ratio * beta / kept if kept else np.sqrt(self._ratio)
+        if self._exact and beta:
             kept, slope = kept * np.sign(beta), slope * np.sign(beta)
         kept, slope = self._sign * kept, self._sign * slope
         return beta * self.along + kept * self._kept, self.along + slope * self._kept
+
+    def turn_of(self, i: int) -> tuple[float, float] | None:
+        """beta at which the coordinate ``i`` turns back along the hyperbola, and the sign of its
+        second derivative there; None if it does not."""
+        along = float(self.along[i])
+        kept = self._sign * float(np.sqrt(self._ratio) * self._kept[i])
+        if not abs(along) < abs(kept):
+            return None
+        return self.width * float(np.sinh(np.arctanh(-along / kept))), float(np.sign(kept))
 
     def linearised(
         self, x: FloatArray, beta: float, closed: bool = False

@@ -351,6 +351,7 @@ class CompiledRun:
                 control=marshalling.control_struct(h=first_step),
                 open_residual=driver.RESIDUAL_EXAMINED,
                 search_below=singular_endpoints.NEAR_SINGULAR_SIGMA,
+                first=True,
                 known=False,
                 quiet=False,
                 examine_below=math.inf,

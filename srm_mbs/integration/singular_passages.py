@@ -1366,7 +1366,7 @@ class Bifurcation:
     def driven(self) -> bool:
         """Whether the drives alone determine the motion, whatever its momentum."""
         monitor = self._crossing._monitor
-        return monitor.geometry.model.nv == monitor.rank
+        return bool(monitor.geometry.model.nv == monitor.rank)
 
     @property
     def configuration(self) -> FloatArray | None:

@@ -15,7 +15,7 @@ from srm_mbs.dynamics.constraints.rows import closure_errors
 from tests.support.backends import on_both
 from tests.support.bundled import load
 from tests.support.mechanisms import along_x, rod
-from tests.support.reduced import G, index_one, n_four_bar, regular_slider_crank
+from tests.support.reduced import G, index_one, n_four_bar, regular_slider_crank, slider_crank
 
 DERIVATIVE = ((1, 0.75), (2, -0.15), (3, 1.0 / 60.0))
 
@@ -242,3 +242,17 @@ def test_states_on_the_closures_stay_as_they_are() -> None:
     assert found.moved == 0.0
     assert "moved" not in str(found)
     np.testing.assert_array_equal(found.q, mechanism.q0)
+
+
+@pytest.mark.parametrize("distance", [1e-2, 1e-3, 1e-4, 1e-5])
+def test_beside_a_singular_configuration_the_state_is_not_moved_by_rounding(
+    distance: float,
+) -> None:
+    """A Newton step on closures that are open by rounding moves the state by that over sigma."""
+    mechanism, reduced = load("slider_crank"), slider_crank()
+    state = np.array([0.5 * np.pi - distance, 1.3])
+    found = srm.linearise(
+        mechanism, state[0] * np.array([1, -2]), state[1] * np.array([1, -2]), coordinates="crank"
+    )
+    np.testing.assert_allclose(found.drift, reduced(0.0, state), rtol=1e-6)
+    np.testing.assert_allclose(found.A, jacobian(reduced, state), atol=1e-8)

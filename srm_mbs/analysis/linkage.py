@@ -404,7 +404,7 @@ class _Analysis:
         positions k and k + 1."""
         column = self.mechanism.joint(name).idx_v
         low, high = self.positions[k : k + 2].tolist()
-        ends = dict(zip((low, high), self._rates[k : k + 2, column].tolist()))
+        ends: dict[float, float] = dict(zip((low, high), self._rates[k : k + 2, column].tolist()))
 
         def rate(crank: float) -> float:
             if crank in ends:

@@ -28,7 +28,7 @@ from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.integration.methods.branch_nodes import onto_closed_branch
 from srm_mbs.integration.methods.near_singular import WATCHED_SIGMA
 from srm_mbs.model.mechanism import per_start
-from srm_mbs.model.validation import START_ARGUMENTS, STATE_ARGUMENTS
+from srm_mbs.model.validation import START_ARGUMENTS
 
 CONSISTENT = 1e-8
 """Closure error of a start, in row units, and of its rates in those per time, up to which it stays
@@ -233,8 +233,8 @@ def closed_states(
                 found,
                 norm,
                 backend,
-                STATE_ARGUMENTS,
-                "Leave this time out, or simulate with a smaller rtol",
+                ("motion", "motion"),
+                "Leave this time out, or simulate with a smaller rtol or shorter steps",
                 f"at t = {time_text(time)} s the state of the run",
             )
     return states, sizes

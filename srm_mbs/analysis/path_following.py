@@ -158,11 +158,13 @@ def follow(mechanism: Mechanism, values: Mapping[str, Any], q: Any = None) -> Fo
     basis, _ = tangent_basis(problem, start.q, np.arange(mechanism.model.nv))
     if np.linalg.matrix_rank(basis[columns], tol=SINGULAR) < len(columns):
         if len(columns) == 1 and basis.shape[1]:
+            (name,) = values
+            stuck = name in mechanism.mobility.unreachable_joints
+            why = "no motion of it moves that joint" if stuck else "it is at a dead point"
             raise InputError(
-                f"{next(iter(values))} does not move here while the mechanism does: this is a dead "
-                "point of it, from which two paths lead",
+                f"{name} does not move here while the mechanism does: {why}",
                 element="values",
-                remedy="Start next to it, or drag another joint",
+                remedy="Drag another joint" if stuck else "Start next to it, or drag another joint",
             )
         raise InputError(
             f"{', '.join(values)} cannot be dragged independently of each other here",

@@ -241,8 +241,8 @@ def check_crank(mechanism: Mechanism, crank: str) -> Mechanism:
     Raises
     ------
     InputError
-        If there is no joint ``crank`` of one degree of freedom, or the mechanism has another number
-        of degrees of freedom.
+        If there is no joint ``crank`` of one degree of freedom, no motion moves it, or the mechanism
+        has another number of degrees of freedom.
     """
     check_mechanism(mechanism)
     mechanism = mechanism.undriven
@@ -253,6 +253,12 @@ def check_crank(mechanism: Mechanism, crank: str) -> Mechanism:
             "do not follow from the crank",
             element="mechanism",
             remedy="Give one of one degree of freedom",
+        )
+    if crank in mechanism.mobility.unreachable_joints:
+        raise InputError(
+            f"no motion of the mechanism moves the joint {crank!r}",
+            element="crank",
+            remedy="Give another joint",
         )
     return mechanism
 

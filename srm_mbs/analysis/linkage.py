@@ -241,8 +241,8 @@ def check_crank(mechanism: Mechanism, crank: str) -> Mechanism:
     Raises
     ------
     InputError
-        If there is no joint ``crank`` of one degree of freedom, no motion moves it, or the mechanism
-        has another number of degrees of freedom.
+        If there is no joint ``crank`` of one degree of freedom, no motion moves it, or the
+        mechanism has another number of degrees of freedom.
     """
     check_mechanism(mechanism)
     mechanism = mechanism.undriven

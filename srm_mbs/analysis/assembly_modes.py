@@ -21,11 +21,12 @@ from srm_mbs.assembly.position import (
     ClosureProblem,
     close_positions,
     onto_singular_point,
+    polish,
     turned_within_limits,
 )
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
-from srm_mbs.errors import InputError, counted, get_logger, naming, safe_repr
+from srm_mbs.errors import InputError, counted, get_logger, naming, safe_repr, warn
 from srm_mbs.model.coordinates import coordinate_names, free_coordinates, set_position
 from srm_mbs.model.numbers import name_list, named_values, positive_integer
 
@@ -37,6 +38,9 @@ INDEPENDENCE_TOLERANCE = 1e-6
 """Smallest rate of a joint, over that of the motion, with which it moves."""
 MAX_NEWTON_STEPS = 40
 """Most Newton steps from one start; longer iterations mostly do not converge."""
+REACH, KEPT = 0.02, 0.3
+"""Motion (rad, scene diagonals) with which a singular mode is tried, and the part of it that a
+configuration keeps which is closed again and belongs to a motion."""
 MIN_MOVABLE_MODES = 3
 """Number of modes in which the mechanism can move after which the search ends."""
 
@@ -101,6 +105,17 @@ def _apart(problem: ClosureProblem, a: FloatArray, b: FloatArray) -> float:
     return float(np.abs(away).max(initial=0.0))
 
 
+def _moves(problem: ClosureProblem, mode: FloatArray, free: IndexArray) -> bool:
+    """Whether closed configurations with the same held joints lie next to a mode: at a singular
+    one, tangents alone do not tell."""
+    basis, _ = tangent_basis(problem, mode, free)
+    for way in (*basis.T, *-basis.T):
+        beside = polish(problem, problem.move(mode, REACH * way), free)
+        if problem.closed(beside) and _apart(problem, mode, beside) > KEPT * REACH * max(abs(way)):
+            return True
+    return False
+
+
 def assembly_modes(
     mechanism: Mechanism,
     q: Mapping[str, Any] | None = None,
@@ -128,8 +143,9 @@ def assembly_modes(
     list of AssemblyMode
         At rest, the one closest to the initial configuration first; hinge angles within half a turn
         of it, or a whole number of turns away, within the limits of their joint.  Modes that lie
-        beyond limits are listed as well.  If one was ``found`` from few starts only, others may be
-        missing; more ``starts`` find them.  Empty if no configuration closes.
+        beyond limits are listed as well; configurations in which the mechanism still moves with
+        these joints held are not, and a warning counts them.  If one was ``found`` from few starts
+        only, others may be missing; more ``starts`` find them.  Empty if no configuration closes.
 
     Raises
     ------
@@ -181,6 +197,16 @@ def assembly_modes(
             _check_isolated(mechanism, problem, modes, free, held)
     if modes:
         _check_isolated(mechanism, problem, modes, free, held)
+    movable = [_moves(problem, mode, free) for mode in modes]
+    if any(movable):
+        warn(
+            f"{sum(np.compress(movable, counts))} of {starts} starts led to closed configurations "
+            f"in which the mechanism still moves with {', '.join(held)} held, as where links lie "
+            "on each other: they are no assembly modes, and left out"
+        )
+        modes, counts = (
+            [one for one, moves in zip(every, movable) if not moves] for every in (modes, counts)
+        )
     log.debug("%s: %d assembly modes from %d starts", mechanism.name, len(modes), int(starts))
     order = sorted(range(len(modes)), key=lambda k: problem.distance(modes[k]))
     return [

@@ -141,9 +141,10 @@ class _Statics:
         point = chart.point(z)
         if point is None:
             raise AnalysisError(
-                "the loops do not close around this configuration",
+                "the loops do not close next to this configuration",
                 q=chart.q,
-                remedy="Give another start",
+                remedy="Give another start: this one may be beside a singular configuration, or at "
+                "a dead point of a joint in hold=",
             )
         return point
 
@@ -227,7 +228,8 @@ def _descend(statics: _Statics, q: FloatArray) -> FloatArray:
     raise AnalysisError(
         "no stable equilibrium was found: the forces go on doing work",
         q=q,
-        remedy="Look for a torque that nothing balances, or give another start",
+        remedy="Look for a force that nothing balances, as gravity on a free body (hold= keeps its "
+        "joint), or give another start",
     )
 
 

@@ -56,6 +56,9 @@ class InverseDynamics:
         Power that they transfer to the mechanism.
     residual : (n,)
         Missing force that the actuators cannot exert, over the largest that the motion needs.
+    moved : (n,)
+        How far the states of a run were moved onto the closures, over its tolerance; 0 for those
+        that stayed as they were.
     """
 
     t: FloatArray
@@ -63,12 +66,15 @@ class InverseDynamics:
     torques: FloatArray
     power: FloatArray
     residual: FloatArray
+    moved: FloatArray
     _reactions: Callable[[], Reactions] = field(repr=False)
 
     def __repr__(self) -> str:
+        moved = int((self.moved > 0.0).sum())
+        also = f", {counted(moved, 'state')} moved onto the closures" if moved else ""
         return (
             f"InverseDynamics({len(self.t)} times, {len(self.actuated)} actuated coordinates, "
-            f"residual at most {self.residual.max(initial=0.0):.2g})"
+            f"residual at most {self.residual.max(initial=0.0):.2g}{also})"
         )
 
     @cached_property
@@ -92,9 +98,10 @@ class InverseDynamics:
 
 
 def _motion(
-    mechanism: Mechanism, motion: Any, t: Any
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """t (n,), q (n, nq), v (n, nv), a (n, nv) of a motion in any of its forms."""
+    mechanism: Mechanism, motion: Any, t: Any, tolerance: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """t (n,), q (n, nq), v (n, nv), a (n, nv) of a motion in any of its forms, and how far its
+    states were moved onto the closures (n,)."""
     nq, nv = mechanism.model.nq, mechanism.model.nv
     if isinstance(motion, SimulationResult):
         if (motion.mechanism.model.nq, motion.mechanism.model.nv) != (nq, nv):
@@ -104,7 +111,9 @@ def _motion(
                 remedy="Give a run of this mechanism",
             )
         run = motion if t is None else motion.at(t)
-        return run.t, run.q, run.v, run.accelerations
+        whole, moved = run.closed_motion(tolerance)
+        q, v, a = np.split(whole, [nq, nq + nv], axis=1)
+        return run.t, q, v, a, moved
     states: list[Any] | None = None
     if callable(motion):
         if t is None:
@@ -136,7 +145,7 @@ def _motion(
             remedy=f"Give a solution, (t, q, v, a) of shapes (n,), (n, {nq}), (n, {nv}), "
             f"(n, {nv}), or a function of t that returns q, v, a",
         )
-    return parts[0], parts[1], parts[2], parts[3]
+    return parts[0], parts[1], parts[2], parts[3], np.zeros(n)
 
 
 def inverse_dynamics(
@@ -157,7 +166,8 @@ def inverse_dynamics(
     motion
         A run (:class:`~srm_mbs.Solution`; the forces include that of its controller), arrays
         (t, q, v, a) of shapes (n,), (n, nq), (n, nv), (n, nv), or a function of t that returns q,
-        v, a.
+        v, a.  States of a run beyond ``tolerance`` are moved onto the closures if that takes at
+        most ten tolerances of the run, as starts of :func:`srm_mbs.simulate` are.
     actuated
         Names of the joints with actuators; by default all joints.
     t : (n,) s
@@ -178,7 +188,7 @@ def inverse_dynamics(
     check_mechanism(mechanism)
     tolerance = positive_number(tolerance, "tolerance")
     mechanism = mechanism.undriven  # the actuators replace the drives
-    times, q, v, a = _motion(mechanism, motion, t)
+    times, q, v, a, moved = _motion(mechanism, motion, t, tolerance)
     names = mechanism.joint_names if actuated is None else actuated
     columns = joint_coordinates(mechanism, (names,) if isinstance(names, str) else names)
     labels = coordinate_names(mechanism)
@@ -198,7 +208,8 @@ def inverse_dynamics(
     system = make_system(mechanism)
     torques, missing, needed = np.zeros((len(times), count)), np.zeros(len(times)), 0.0
     for i, time in enumerate(times):
-        _check_motion(geometry, time, q[i], v[i] / unit, a[i] / unit, tolerance)
+        with np.errstate(over="ignore", invalid="ignore"):
+            _check_motion(geometry, time, q[i], v[i] / unit, a[i] / unit, tolerance)
         basis, _ = tangent_basis(geometry, q[i], np.arange(nv))
         if basis.shape[1] != free:
             raise InputError(
@@ -229,7 +240,7 @@ def inverse_dynamics(
     power = (torques * v[:, columns]).sum(axis=1)
     reactions = partial(_reactions, mechanism, times, q, v, torques, columns)
     return InverseDynamics(
-        times, tuple(labels[j] for j in columns), torques, power, residual, reactions
+        times, tuple(labels[j] for j in columns), torques, power, residual, moved, reactions
     )
 
 
@@ -245,19 +256,25 @@ def _check_motion(
     g, G = geometry.closure(q)
     # At rest the error is rounding: it is compared with the characteristic rate.
     rate = structure_of(geometry.mechanism).units.rate
-    speed = max(float(np.abs(u).max(initial=0.0)), rate)
+    speed = np.abs(u).max(initial=rate)
     bias = geometry.bias(q, u) * geometry.row_size
     checks = (
         ("positions", g, 1.0),
         ("rates", G @ u, speed),
-        ("accelerations", G @ a + bias, max(float(np.abs(a).max(initial=0.0)), speed**2)),
+        ("accelerations", G @ a + bias, np.abs(a).max(initial=speed * speed)),
     )
     for what, error, size in checks:
-        worst = float(np.abs(error).max(initial=0.0))
+        worst = np.abs(error).max(initial=0.0)
+        if not np.isfinite(worst + size):
+            raise InputError(
+                f"at t = {time_text(time)} s the motion is so fast that its accelerations overflow",
+                element="motion",
+                remedy="Give rates in rad/s and m/s, accelerations in rad/s^2 and m/s^2",
+            )
         if worst > tolerance * size:
             raise InputError(
                 f"at t = {time_text(time)} s the {what} of the motion violate the closures by "
-                f"{worst / size if size else worst:.1e}",
+                f"{worst / size:.1e}",
                 element="motion",
                 remedy="Close positions and rates with srm.assemble, or simulate a motion",
             )

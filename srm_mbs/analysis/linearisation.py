@@ -31,12 +31,14 @@ from srm_mbs.errors import InputError, counted, get_logger, naming, safe_repr
 from srm_mbs.model.coordinates import coordinate_names, joint_coordinates
 from srm_mbs.model.lazy import cached_property
 from srm_mbs.model.numbers import finite_number, positive_integer, positive_number
+from srm_mbs.model.validation import STATE_ARGUMENTS
+from srm_mbs.simulation.consistency import closed_start
+from srm_mbs.simulation.options import RunOptions
+from srm_mbs.simulation.runner import checked_accuracy, error_norm
 from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 log = get_logger(__name__)
 
-CONSTRAINT_TOLERANCE, RATE_TOLERANCE = 1e-9, 1e-9
-"""Largest closure error of the state and its rate, over units."""
 FRICTION_STEP = 0.01
 """Largest difference of rates, over the friction speed."""
 INDEPENDENCE_TOLERANCE = 1e-6
@@ -52,7 +54,7 @@ class Linearisation:
     Attributes
     ----------
     q : (nq,), v : (nv,)
-        The state.
+        The state, on the closures.
     A : (2 k, 2 k), B : (2 k, ni)
         System and input matrix; rad, m, s, N, N m.
     coordinates : k names
@@ -63,6 +65,9 @@ class Linearisation:
         x' at the state itself: (z', z''), zero at an equilibrium.
     to_joints : (nv, k)
         Velocity of all joints per w: the motion of the mechanism in each coordinate.
+    moved
+        How far the given state was moved onto the closures, over the tolerance of its run; 0 if it
+        stayed as it was.
     eigenvalues : (2 k,)
         Of A, 1/s, slowest first; conjugate pairs together.
     """
@@ -76,6 +81,7 @@ class Linearisation:
     inputs: tuple[str, ...]
     drift: FloatArray
     to_joints: FloatArray
+    moved: float
     chart: TangentChart
 
     def __repr__(self) -> str:
@@ -96,6 +102,10 @@ class Linearisation:
             "drift": self.drift,
             "eigenvalues (1/s)": self.eigenvalues,
         }
+        if self.moved:
+            shown["q and v were moved onto the closures, over the tolerance by"] = (
+                f"{self.moved:.2g}"
+            )
         return "\n".join([repr(self), *(f"{name}:\n{value}" for name, value in shown.items())])
 
     @cached_property
@@ -225,6 +235,7 @@ def linearise(
     inputs: str | Iterable[str] | None = None,
     coordinates: str | Iterable[str] | None = None,
     step: float = TAU,
+    rtol: float = 1e-6,
 ) -> Linearisation:
     """Linearise the equations of motion of a mechanism at a state.
 
@@ -245,6 +256,10 @@ def linearise(
     step
         Step of the differences, rad or scene diagonals; their error is proportional to its sixth
         power.
+    rtol
+        Relative tolerance of the run that the state is from.  A state that violates the closures by
+        more than 1e-8 is moved onto them if that takes at most ten tolerances, as starts of
+        :func:`srm_mbs.simulate` are.
 
     Raises
     ------
@@ -259,11 +274,20 @@ def linearise(
         q, v = mechanism.q0, mechanism.v0 if v is None else v
     v = np.zeros(mechanism.model.nv) if v is None else v
     mechanism = mechanism.moved(q, v)
-    q, v = np.array(mechanism.q0), np.array(mechanism.v0)
+    options = checked_accuracy(mechanism, RunOptions(np.inf, rtol=rtol), 0.0, np.inf)
+    state, moved = closed_start(
+        mechanism,
+        0.0,
+        error_norm(mechanism, options),
+        names=STATE_ARGUMENTS,
+        remedy="Use srm.assemble(mechanism, q=..., v=...), or give the rtol of the run that the "
+        "state is from",
+    )
+    q, v = np.split(state, [mechanism.model.nq])
+    mechanism = mechanism.moved(q, v)
     geometry = ClosureGeometry(mechanism, q)
     unit, nv = geometry.unit, mechanism.model.nv
     everything = np.arange(nv)
-    _check_state(geometry, q, v)
     basis, _ = tangent_basis(geometry, q, everything)
     k = nv - mechanism.structure.rank
     if basis.shape[1] != k:
@@ -324,19 +348,6 @@ def linearise(
         tuple(labels[i] for i in columns),
         drift,
         unit[:, None] * velocities / unit[chosen],
+        moved,
         chart,
     )
-
-
-def _check_state(geometry: ClosureGeometry, q: FloatArray, v: FloatArray) -> None:
-    g, G = geometry.closure(q)
-    rate = np.abs(G @ (v / geometry.unit)).max(initial=0.0)
-    if np.abs(g).max(initial=0.0) > CONSTRAINT_TOLERANCE or rate > RATE_TOLERANCE * max(
-        1.0, np.abs(v).max()
-    ):
-        raise InputError(
-            f"the state is not consistent: closure error {np.abs(g).max():.1e}, rate {rate:.1e} "
-            "(over units)",
-            element="q, v",
-            remedy="Use srm.assemble",
-        )

@@ -50,6 +50,9 @@ WHOLE_TURN = 0.5
 """Net motion (rad) of a joint over a turn of the crank above which it turns fully itself."""
 REFINED = 1e-12
 """Accuracy (rad, m) of the crank's position at a limit."""
+STILL, DEAD = 1e-12, 1e-6
+"""Rate of a joint, over that of the mechanism (in units), below which it rests: rounding; at a dead
+point of the crank, which is known to the root of it, DEAD."""
 CORRECTION = 0.1
 """Distance of a closed configuration from the tangent of the path, over the way along it, below
 which it is on that path."""
@@ -238,8 +241,8 @@ def check_crank(mechanism: Mechanism, crank: str) -> Mechanism:
     Raises
     ------
     InputError
-        If there is no joint ``crank`` of one degree of freedom, or the mechanism has another number
-        of degrees of freedom.
+        If there is no joint ``crank`` of one degree of freedom, no motion moves it, or the
+        mechanism has another number of degrees of freedom.
     """
     check_mechanism(mechanism)
     mechanism = mechanism.undriven
@@ -250,6 +253,12 @@ def check_crank(mechanism: Mechanism, crank: str) -> Mechanism:
             "do not follow from the crank",
             element="mechanism",
             remedy="Give one of one degree of freedom",
+        )
+    if crank in mechanism.mobility.unreachable_joints:
+        raise InputError(
+            f"no motion of the mechanism moves the joint {crank!r}",
+            element="crank",
+            remedy="Give another joint",
         )
     return mechanism
 
@@ -318,9 +327,11 @@ class _Analysis:
         self.joints: KnownKeys[FloatArray] = KnownKeys(
             (name, joint_track(mechanism, q, name)) for name in names
         )
+        driving = rates[:, [mechanism.joint(crank).idx_v]].copy()
+        rates[np.abs(rates) <= STILL * self._unit] = 0.0
         with np.errstate(divide="ignore", invalid="ignore"):
-            along = rates / rates[:, [mechanism.joint(crank).idx_v]]
-        self._along = along
+            along = rates / driving
+        self._along, self._rates = along, rates
         self._closures = ClosureProblem(mechanism, mechanism.q0)
         self._free = np.delete(np.arange(mechanism.model.nv), mechanism.joint(crank).idx_v)
         self.ratios: KnownKeys[FloatArray] = KnownKeys(
@@ -335,8 +346,9 @@ class _Analysis:
 
     def report(self, dead: tuple[float, ...]) -> LinkageReport:
         """The report, with the positions of the crank beyond which it cannot move."""
+        self._orient_at_dead_points()
         strokes = KnownKeys(
-            (name, self._stroke(name, values, dead))
+            (name, self._stroke(name, values))
             for name, values in self.joints.items()
             if not self._turns_fully(name, values)
         )
@@ -355,14 +367,25 @@ class _Analysis:
             lengths,
         )
 
+    def _orient_at_dead_points(self) -> None:
+        """Give the rates at dead points, where the crank has none, the sense of those beside them;
+        joints that rest there as well keep the rates that they have beside them."""
+        column = self.mechanism.joint(self.crank).idx_v
+        rests = np.abs(self._rates) <= DEAD * self._unit
+        moving = np.flatnonzero(~rests[:, column])
+        for i in np.flatnonzero(rests[:, column]).tolist():
+            inside = int(moving[np.argmin(np.abs(moving - i))])
+            way = self._closures.difference(self.q[inside], self.q[i]) * (inside < i or -1.0)
+            sense = np.copysign(1.0, way @ (self._rates[i] / self._unit))
+            self._rates[i] = np.where(rests[i], self._rates[inside], sense * self._rates[i])
+
     def _turns_fully(self, name: str, values: FloatArray) -> bool:
         turning = is_angle(self.mechanism.model, name)
         return self.turns and turning and abs(values[-1] - values[0]) > WHOLE_TURN
 
-    def _stroke(self, name: str, values: FloatArray, dead: tuple[float, ...]) -> Stroke:
-        # Where the crank cannot move the ratio passes infinity, not zero.
-        ratio = np.where(np.isin(self.positions, dead), np.nan, self.ratios[name])
-        changes = np.flatnonzero(ratio[:-1] * ratio[1:] < 0.0)
+    def _stroke(self, name: str, values: FloatArray) -> Stroke:
+        back = self._rates[:, self.mechanism.joint(name).idx_v] < 0.0
+        changes = np.flatnonzero(back[:-1] != back[1:])
         at = [self._limit(name, k) for k in changes.tolist()]
         cranks = np.concatenate([self.positions, [crank for crank, _ in at]])
         reached = np.concatenate([values, [value for _, value in at]])
@@ -386,11 +409,14 @@ class _Analysis:
         """Positions of the crank and of the joint ``name`` where that turns back, between the
         positions k and k + 1."""
         column = self.mechanism.joint(name).idx_v
+        low, high = self.positions[k : k + 2].tolist()
+        ends: dict[float, float] = dict(zip((low, high), self._rates[k : k + 2, column].tolist()))
 
         def rate(crank: float) -> float:
+            if crank in ends:
+                return ends[crank]
             return float(self.rates(self._configuration(k, crank))[column])
 
-        low, high = self.positions[k : k + 2]
         crank = float(brentq(rate, low, high, xtol=REFINED))
         value = position_of(self.mechanism, self._configuration(k, crank), name)
         if is_angle(self.mechanism.model, name):
@@ -398,8 +424,11 @@ class _Analysis:
         return crank, float(value)
 
     def _configuration(self, k: int, crank: float) -> FloatArray:
-        """The configuration (nq,) where the crank is at ``crank`` (rad, m), next to position k."""
+        """The configuration (nq,) where the crank is at ``crank`` (rad, m), between the positions k
+        and k + 1."""
         problem = self._closures
+        if not np.isfinite(self._along[k]).all() or (k == 0 and not self.turns):
+            k += 1  # nothing leads away from a dead point
         move = self._along[k] * (crank - self.positions[k]) / problem.unit
         way = float(np.linalg.norm(move))
         if way < 1.0:  # beside a dead point the tangent is no guess
@@ -408,8 +437,8 @@ class _Analysis:
             off = float(np.linalg.norm(problem.difference(guess, found)))
             if problem.closed(found) and off <= CORRECTION * way + REFINED:
                 return found
-        near: FloatArray = follow(self.mechanism, {self.crank: [crank]}, self.q[k]).q[-1]
-        return near
+        path = follow(self.mechanism, {self.crank: [crank]}, self.q[k])
+        return path.q[-1] if path.limit is None else path.limit.q  # at a dead point, to rounding
 
 
 def four_bar_of(

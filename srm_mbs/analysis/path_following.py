@@ -17,6 +17,7 @@ from srm_mbs.assembly.continuation import drag
 from srm_mbs.assembly.position import ClosureProblem
 from srm_mbs.dynamics.constraints.local_coordinates import tangent_basis
 from srm_mbs.dynamics.mechanism import Mechanism, check_mechanism
+from srm_mbs.dynamics.scaling import is_angle
 from srm_mbs.dynamics.singularities.local_analysis import SINGULAR
 from srm_mbs.errors import InputError, get_logger, safe_repr
 from srm_mbs.model.coordinates import position_of
@@ -25,6 +26,9 @@ from srm_mbs.visualization.animation.joint_motion import JointMotion
 
 log = get_logger(__name__)
 
+LONGEST_WAY = 1e4
+"""Length of the way of a joint (rad, scene diagonals): 1600 turns, in 10^5 steps; the rounding of
+positions ends a path after 30,000."""
 BRANCH_COSINE = 0.9
 """Smallest cosine between successive tangents on one branch."""
 
@@ -153,12 +157,31 @@ def follow(mechanism: Mechanism, values: Mapping[str, Any], q: Any = None) -> Fo
         )
     basis, _ = tangent_basis(problem, start.q, np.arange(mechanism.model.nv))
     if np.linalg.matrix_rank(basis[columns], tol=SINGULAR) < len(columns):
+        if len(columns) == 1 and basis.shape[1]:
+            (name,) = values
+            stuck = name in mechanism.mobility.unreachable_joints
+            why = "no motion of it moves that joint" if stuck else "it is at a dead point"
+            raise InputError(
+                f"{name} does not move here while the mechanism does: {why}",
+                element="values",
+                remedy="Drag another joint" if stuck else "Start next to it, or drag another joint",
+            )
         raise InputError(
             f"{', '.join(values)} cannot be dragged independently of each other here",
             element="values",
             remedy=f"Drag at most {basis.shape[1]}, which move independently",
         )
     here = np.array([position_of(mechanism, start.q, name) for name in values])
+    ways = np.abs(np.diff(np.vstack([here, wanted]), axis=0)).sum(axis=0) / problem.unit[columns]
+    for name, way in zip(values, ways.tolist()):
+        if not way <= LONGEST_WAY:
+            raise InputError(
+                f"the way of {name} through its values is {way:.3g} times "
+                f"{'1 rad' if is_angle(mechanism.model, name) else 'the size of the mechanism'}, "
+                f"and at most {LONGEST_WAY:g} can be followed",
+                element="values",
+                remedy="Give values in rad and m, near the start",
+            )
     found = drag(problem, start.q, columns, wanted - here, mechanism.structure.rank)
 
     def named(displacement: FloatArray) -> dict[str, float]:

@@ -39,6 +39,9 @@ CORRECTION = 0.3
 """Largest correction of a step, as a part of it."""
 BENDS = 0.95
 """Smallest cosine between the tangents at the ends of a step."""
+LONGEST, STEEPEST = 100.0, 300.0
+"""Length of a path in units, and more of it over the way of the dragged coordinates, after which it
+leads away without end: a slide moves to infinity as the dragged joints come near to a value."""
 CLOSE = 1e-5
 """Singular value of the closures below which the tangent is that of the step before."""
 BETWEEN = 1.2
@@ -110,6 +113,7 @@ class _Follower:
         self.points = [Waypoint(start, np.zeros(len(columns)), 0.0)]
         self.tangents: list[FloatArray] = []
         self.cosine = 1.0
+        self.endless = False
 
     def segment(self, s: float, values: FloatArray, slope: FloatArray) -> None:
         """From s on the dragged coordinates are values + slope (s' - s)."""
@@ -179,8 +183,12 @@ class _Follower:
 
     def run(self, end: float) -> bool:
         """Follow the path to s = end; False if it turns back before, or ends."""
-        length, growing = LARGEST_STEP, True
+        length, growing, travelled = LARGEST_STEP, True, 0.0
+        longest = LONGEST + STEEPEST * (end - self.points[-1].s)
         while self.points[-1].s < end:
+            if travelled > longest:
+                self.endless = True
+                return False
             along = self.tangents[-1]
             step = min(length, (end - self.points[-1].s) / along[-1]) if along[-1] > 0.0 else length
             found = self.advance(length, end)
@@ -191,6 +199,7 @@ class _Follower:
                 back = ahead[-1] <= 0.0 or cosine < 0.0
                 if point.s > self.points[-1].s and not back and cosine > BENDS:
                     self.cosine = min(self.cosine, cosine)
+                    travelled += step
                     self.points.append(point)
                     self.tangents.append(ahead)
                     if growing:
@@ -240,7 +249,8 @@ def drag(
             complete = False
             break
         reached.append(follower.points[-1].q)
-    turned = not complete and follower.tangents[-1][-1] < np.sqrt(SMALLEST_STEP) * 10.0
+    steep = follower.tangents[-1][-1] < np.sqrt(SMALLEST_STEP) * 10.0
+    turned = not complete and steep and not follower.endless
     path = follower.points
     return Drag(
         np.array(reached),

@@ -1,10 +1,11 @@
-"""Consistency of states with closures and drives: the starts of runs, and their ends.
+"""Consistency of states with closures and drives: the starts of runs, their states, their ends.
 
 The correction at the end of a step closes the loops up to the square of what it corrects, and dense
 output lies within the tolerance of the closures, so states of a run may be farther from them than
-:data:`CONSISTENT`.  A run may start at such states of another one all the same:
-:func:`closed_start` moves a start onto the closures if its tolerance allows that,
-:func:`closed_end` the end of a run, from where one with any tolerance may go on.
+:data:`CONSISTENT`.  A run may start at such states of another one all the same, and an analysis may
+begin there: :func:`closed_start` moves a start onto the closures if its tolerance allows that,
+:func:`closed_states` the states of a run, :func:`closed_end` its end, from where one with any
+tolerance may go on.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from srm_mbs.dynamics.mechanism import Mechanism
 from srm_mbs.dynamics.multibody import ClosedSystem, OpenSystem, make_system
 from srm_mbs.dynamics.scaling import Units, constraint_units
 from srm_mbs.dynamics.system import System, onto_closures
-from srm_mbs.errors import EvaluationError, InputError
+from srm_mbs.errors import EvaluationError, InputError, time_text
 from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.observables import closure_errors, largest_errors
 from srm_mbs.integration.methods.base import ErrorNorm
@@ -173,8 +174,10 @@ def closed_start(
     backend: str = "python",
     system: OpenSystem | ClosedSystem | None = None,
     names: tuple[str, str] = START_ARGUMENTS,
-) -> FloatArray:
-    """The state (nq + nv,) on the closures and drives in which a run of ``mechanism`` starts.
+    remedy: str = "",
+) -> tuple[FloatArray, float]:
+    """The state (nq + nv,) on the closures and drives in which a run of ``mechanism`` starts, and
+    how far it was moved for that, over the tolerance of the run.
 
     It is the initial state itself (``mechanism.start_state``) up to :data:`CONSISTENT`.  Beyond, it
     is that moved along the normals, velocities by the M-orthogonal projection, if the motion is at
@@ -184,6 +187,8 @@ def closed_start(
     ----------
     mechanism, t, backend, system, names
         As for :func:`check_consistent`.
+    remedy
+        What the reader of a refusal can do, instead of that for starts of runs.
 
     Raises
     ------
@@ -192,9 +197,62 @@ def closed_start(
         configuration that the motion might lead to another branch.
     """
     found = _violated(mechanism, t, backend, system)
-    state = mechanism.start_state
     if found is None:
-        return state
+        return mechanism.start_state, 0.0
+    return _moved(mechanism, t, found, norm, backend, names, remedy)
+
+
+def closed_states(
+    mechanism: Mechanism,
+    t: FloatArray,
+    states: FloatArray,
+    norm: ErrorNorm,
+    backend: str,
+    system: OpenSystem | ClosedSystem,
+    consistent: float,
+) -> tuple[FloatArray, FloatArray]:
+    """``states`` (n, nq + nv) of a run of ``mechanism`` at ``t`` (n,) s, and their motions (n,)
+    onto the closures and drives, over the tolerance of the run.
+
+    States that violate these by ``consistent`` at most stay as they are; the others are moved as
+    those of :func:`closed_start`, whose parameters these are.
+
+    Raises
+    ------
+    InputError
+        As of :func:`closed_start`, naming the time.
+    """
+    states, sizes, nq = states.copy(), np.zeros(len(t)), mechanism.model.nq
+    for k, (time, state) in enumerate(zip(t.tolist(), states)):
+        q, v = state[:nq], state[nq:]
+        found = largest_violation(mechanism, time, q, v, backend, system, None, consistent)
+        if found is not None:
+            states[k], sizes[k] = _moved(
+                mechanism.moved(q, v),
+                time,
+                found,
+                norm,
+                backend,
+                ("motion", "motion"),
+                "Leave this time out, or simulate with a smaller rtol or shorter steps",
+                f"at t = {time_text(time)} s the state of the run",
+            )
+    return states, sizes
+
+
+def _moved(
+    mechanism: Mechanism,
+    t: float,
+    found: Violation,
+    norm: ErrorNorm,
+    backend: str,
+    names: tuple[str, str],
+    remedy: str,
+    what: str = "the state",
+) -> tuple[FloatArray, float]:
+    """The initial state (nq + nv,), which has the violation ``found``, moved onto the closures, and
+    the motion over the tolerance; messages call it ``what``."""
+    state = mechanism.start_state
     also, near_singular = "", False
     with suppress(EvaluationError):
         closures = make_system(mechanism)  # the controller is not called
@@ -214,8 +272,8 @@ def closed_start(
         elif not motion.is_open:
             there = mechanism.moved(*closures.split(closed))
             if _violated(there, t, backend) is None:
-                return closed
-    raise _refusal(mechanism, t, found, names, also, near_singular)
+                return closed, motion.size
+    raise _refusal(mechanism, t, found, names, also, near_singular, remedy, what)
 
 
 def _violated(
@@ -238,22 +296,28 @@ def _refusal(
     names: tuple[str, str],
     also: str = "",
     near_singular: bool = False,
+    remedy: str = "",
+    what: str = "the state",
 ) -> InputError:
-    """The error about the violation ``found`` of a start at ``t`` (s); ``also`` says more of it."""
+    """The error about the violation ``found`` of ``what``, the start at ``t`` (s); ``also`` says
+    more of it."""
     rows = mechanism.structure.row_names
     kind = "drives" if found.row >= len(rows) - len(mechanism.drives) else "closures"
     q, v = names
     at = f", {t!r}" if t else ""
     projected = f"srm.Simulator(mechanism).reset({q}, {v}{at}, project=True)"
-    remedy = "Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v"
-    if near_singular:
+    if remedy:
+        pass
+    elif near_singular:
         remedy = (
             f"Start at another time of the motion, or on the branch of {v}: {projected} returns it"
         )
     elif mechanism.drives and t:  # where drives lead to by then, assembly does not know
         remedy = f"Use {projected}, which returns a consistent q and v"
+    else:
+        remedy = "Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v"
     return InputError(
-        f"the state violates the {kind}: row {rows[found.row]} by {found.value:.1e}{also}",
+        f"{what} violates the {kind}: row {rows[found.row]} by {found.value:.1e}{also}",
         element=names[found.rate],
         remedy=remedy,
     )

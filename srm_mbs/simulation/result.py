@@ -38,6 +38,7 @@ from srm_mbs.integration.kernel import dense_output as kernel_steps
 from srm_mbs.integration.kernel.backend import COMPILED
 from srm_mbs.integration.kernel.dense_output import CompiledDenseOutput
 from srm_mbs.integration.kernel.observables import CompiledObservables
+from srm_mbs.integration.methods.base import ErrorNorm
 from srm_mbs.integration.methods.butcher import ButcherTableau
 from srm_mbs.integration.methods.psrm import is_split
 from srm_mbs.integration.run_samples import RunSamples, run_samples
@@ -49,7 +50,7 @@ from srm_mbs.integration.singular_passages import (
 )
 from srm_mbs.model.anchors import Anchor
 from srm_mbs.model.lazy import cached_property
-from srm_mbs.simulation.consistency import closed_end
+from srm_mbs.simulation.consistency import closed_end, closed_states
 from srm_mbs.simulation.energy_balance import EnergyBalance, Powers, energy_balance
 from srm_mbs.simulation.options import RunOptions
 from srm_mbs.simulation.streamed_output import StreamedOutput
@@ -627,6 +628,24 @@ class SimulationResult(RunOutcome):
         """
         self._need_controller("acceleration")
         return self.observables.accelerations(self.t, self.q, self.v)
+
+    def closed_motion(self, consistent: float) -> tuple[FloatArray, FloatArray]:
+        """The motion at ``t`` on the closures and drives: (q, v, v') (n, nq + 2 nv), and how far
+        each state was moved (n,) for it, over the tolerance of the run.
+
+        See :func:`~srm_mbs.simulation.consistency.closed_states` for ``consistent`` and errors.
+        """
+        states = np.concatenate((self.q, self.v), axis=1)
+        accelerations, sizes = self.accelerations, np.zeros(len(states))
+        if self.mechanism.constrained:
+            norm = ErrorNorm(np.array(self.settings.atol), self.settings.rtol)
+            states, sizes = closed_states(
+                self.mechanism, self.t, states, norm, self.backend, self._system, consistent
+            )
+        if sizes.any():
+            q, v = np.split(states, [self.mechanism.model.nq], axis=1)
+            accelerations = self.observables.accelerations(self.t, q, v)
+        return np.concatenate((states, accelerations), axis=1), sizes
 
     def point(self, point: Anchor | str) -> PointMotion:
         """Motion of a point of a link at ``t``: position, velocity and acceleration (n, 3), world

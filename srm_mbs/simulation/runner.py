@@ -547,7 +547,7 @@ def assemble_problem(
         norm = error_norm(mechanism, options)
         mechanism.check_covers(t_end)
     if mechanism.constrained:
-        closed = closed_start(mechanism, t0, norm, by, system)
+        closed, _ = closed_start(mechanism, t0, norm, by, system)
         if closed is not mechanism.start_state:
             q0, v0 = system.split(closed)
             return assemble_problem(mechanism, options._replace(q0=q0, v0=v0), before)

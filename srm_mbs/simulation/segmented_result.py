@@ -205,6 +205,11 @@ class SegmentedResult(SimulationResult):
         """See :attr:`~srm_mbs.Solution.accelerations`."""
         return self.rows_of_parts(lambda part: part.accelerations)
 
+    def closed_motion(self, consistent: float) -> tuple[FloatArray, FloatArray]:
+        """See :meth:`~srm_mbs.simulation.result.SimulationResult.closed_motion`."""
+        motions, sizes = zip(*(part.closed_motion(consistent) for part in self._parts))
+        return self._ordered(list(motions)), self._ordered(list(sizes))
+
     @cached_property
     def energy_balance(self) -> EnergyBalance:
         """See :attr:`~srm_mbs.Solution.energy_balance`; what actions change is in ``events``."""

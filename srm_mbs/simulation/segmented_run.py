@@ -437,7 +437,7 @@ def _at_start(
     contacts = [event for event in events if event.may_touch and event.left > 1]
     if contacts:
         if started.constrained:
-            closed = closed_start(started, t0, error_norm(started, options))
+            closed, _ = closed_start(started, t0, error_norm(started, options))
             if closed is not x:
                 started, x = initial_state(mechanism, t0, closed[:nq], closed[nq:])
         found = _act_at_once(

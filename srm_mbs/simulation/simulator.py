@@ -132,7 +132,7 @@ class Simulator:
         options = above_rounding(mechanism, options)
         check_embedded(options.method.scheme, step)
         self._norm = error_norm(mechanism, options)
-        state = closed_start(mechanism, 0.0, self._norm)
+        state, _ = closed_start(mechanism, 0.0, self._norm)
         if state is not mechanism.start_state:
             nq = mechanism.model.nq
             mechanism = mechanism.with_state(state[:nq], state[nq:])
@@ -389,7 +389,7 @@ class Simulator:
         if q is None and v is None and not project:
             state = mechanism.start_state
             if mechanism.drives:
-                state = closed_start(mechanism, t, self._norm, names=STATE_ARGUMENTS)
+                state, _ = closed_start(mechanism, t, self._norm, names=STATE_ARGUMENTS)
         else:
             q = mechanism.q0 if q is None else q
             v = mechanism.v0 if v is None else v
@@ -436,7 +436,7 @@ class Simulator:
                 ) from error
             q, v = state[: self._nq], state[self._nq :]
         moved = self._mechanism.moved(q, v)
-        return closed_start(moved, t, self._norm, names=STATE_ARGUMENTS)
+        return closed_start(moved, t, self._norm, names=STATE_ARGUMENTS)[0]
 
     @_alone
     def clone(self) -> Simulator:

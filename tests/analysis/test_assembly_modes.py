@@ -6,12 +6,14 @@ from itertools import product
 
 import numpy as np
 import pinocchio as pin
+import pytest
 from scipy.optimize import brentq
 
 import srm_mbs as srm
 from srm_mbs.assembly.position import beyond_limits
 from srm_mbs.cli.tables import mode_rows
 from srm_mbs.dynamics.scaling import periodic_coordinates
+from tests.support.bundled import load
 from tests.support.mechanisms import along_x, rod
 
 Z = pin.JointModelRZ
@@ -183,6 +185,23 @@ def test_a_crank_that_cannot_be_there_has_no_modes_and_a_singular_one_is_marked(
     np.testing.assert_allclose(np.cos(straight.q[2]), -1.0)
     fold = srm.assembly_modes(srm.load("slider_crank"), {"crank": 0.5 * np.pi}, starts=20)
     assert [mode.singular for mode in fold] == [True]
+
+
+def test_configurations_that_still_move_are_no_modes() -> None:
+    """Stages whose links lie on each other turn freely."""
+    mechanism = load("scissor_lift")
+    with pytest.warns(srm.SrmWarning, match=r"\d+ of 60 starts .* still moves with foot held"):
+        modes = srm.assembly_modes(mechanism, starts=60)
+    assert len(modes) == 4
+    assert not any(mode.singular for mode in modes)
+    assert sum(mode.found for mode in modes) < 60
+
+
+def test_a_singular_mode_that_does_not_move_stays_one() -> None:
+    """The rod of equal bars over the pivot: a double solution, to which Newton's method creeps."""
+    (mode,) = srm.assembly_modes(load("slider_crank"), {"crank": 0.5 * np.pi}, starts=20)
+    assert mode.singular
+    assert mode.found >= 19
 
 
 def test_the_same_seed_finds_the_same() -> None:

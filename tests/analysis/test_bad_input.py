@@ -21,6 +21,8 @@ def test_what_cannot_be_analysed_is_refused(tmp_path: Path) -> None:
     found = linearise(four)
     run = srm.simulate(four, 0.2, rtol=1e-6)
     fixed = srm.simulate(four, 0.1, step=0.01)
+    loose = srm.simulate(four, 2.0, rtol=1e-3)
+    steps = srm.simulate(four, 1.0, step=0.1)
     fold = srm.assemble(crank, {"crank": 0.5 * np.pi}).q
     t, q, v, a = run.t, run.q, run.v, run.accelerations
     drive = partial(srm.inverse_dynamics, four, actuated="crank")
@@ -38,6 +40,7 @@ def test_what_cannot_be_analysed_is_refused(tmp_path: Path) -> None:
         "modes: no starts": lambda: modes(four, starts=0),
         "equilibrium: search": lambda: srm.equilibrium(four, search="best"),
         "equilibrium: singular start": lambda: srm.equilibrium(crank, [0.5 * np.pi, np.pi]),
+        "linearise: loose run": lambda: linearise(four, *loose(1.85)),
         "linearise: open loop": lambda: linearise(four, four.q0 + 0.1),
         "linearise: too many coordinates": lambda: linearise(four, coordinates=["crank", "rocker"]),
         "linearise: singular": lambda: linearise(beam, beam.q0),
@@ -52,6 +55,8 @@ def test_what_cannot_be_analysed_is_refused(tmp_path: Path) -> None:
         "mode shape: half a frame": lambda: found.mode_shape(0, frames=2.5),
         "follow: nan": lambda: follow(four, {"crank": np.nan}),
         "follow: text": lambda: follow(four, {"crank": "up"}),
+        "follow: far": lambda: follow(four, {"crank": [2.0, -1e100]}),
+        "follow: dead point": lambda: follow(load("squeezing_mechanism"), {"gamma": 1.0}),
         "follow: lengths": lambda: follow(four, {"crank": [1.0, 2.0], "rocker": [1.0]}),
         "follow: nothing": lambda: follow(four, {}),
         "follow: dependent joints": lambda: follow(four, {"crank": 1.0, "rocker": 1.4}),
@@ -62,6 +67,8 @@ def test_what_cannot_be_analysed_is_refused(tmp_path: Path) -> None:
         "inverse dynamics: positions": lambda: drive((t, q + 0.1, v, a)),
         "inverse dynamics: rates": lambda: drive((t, q, v + 0.1, a)),
         "inverse dynamics: accelerations": lambda: drive((t, q, v, a + 0.1)),
+        "inverse dynamics: overflow": lambda: drive((t, q, 1e200 * v, a)),
+        "inverse dynamics: long steps": lambda: drive(steps.at([0.5455])),
         "inverse dynamics: three arrays": lambda: drive((t[:1], q[:1], v[:1])),
         "inverse dynamics: times": lambda: drive(moving),
         "inverse dynamics: None": lambda: drive(lambda t: None, t=[0.0, 0.1]),

@@ -14,6 +14,7 @@ from srm_mbs.analysis import inverse_dynamics
 from srm_mbs.dynamics.constraints.rows import LoopKinematics
 from srm_mbs.dynamics.observables import Observables
 from srm_mbs.integration.kernel.observables import make_observables
+from tests.support.backends import on_both
 from tests.support.bundled import load
 from tests.support.mechanisms import floating_ring
 
@@ -176,6 +177,76 @@ def test_a_motion_given_as_a_function_may_be_read_at_no_time() -> None:
         found = srm.inverse_dynamics(mechanism, motion, "crank", t=[])
         assert found.torques.shape == (0, 1)
         assert found.reactions["pin"].shape == (0, 6)
+
+
+@on_both
+@pytest.mark.parametrize("name", ["four_bar", "quick_return", "squeezing_mechanism"])
+def test_torques_are_recovered_from_a_run_with_a_loose_tolerance(name: str, backend: str) -> None:
+    """Its states violate the closures by up to 1e-3.  The rest is the damping of the torque, whose
+    rates are moved by a part of the tolerance."""
+    mechanism, rtol = load(name).undriven, 1e-3
+    crank = mechanism.joint_names[0]
+
+    def torque(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        out = np.zeros(mechanism.model.nv)
+        out[0] = 0.5 * np.sin(9.0 * t) - 0.01 * v[0]
+        return out
+
+    span = 0.03 if name == "squeezing_mechanism" else 1.0
+    run = srm.simulate(mechanism, span, rtol=rtol, controller=torque, backend=backend)
+    run = run.at(np.linspace(0.0, span, 40))
+    assert run.drift.max() > 1e-5
+    found = srm.inverse_dynamics(mechanism, run, crank)
+    assert 0.0 < found.moved.max() < 1.0
+    assert f"{(found.moved > 0.0).sum()} states moved onto the closures" in repr(found)
+    given = [torque(*state)[0] for state in zip(run.t, run.q, run.v)]
+    size = 0.01 * np.abs(run.v).max()
+    np.testing.assert_allclose(found.torques[:, 0], given, rtol=0.0, atol=rtol * size)
+
+
+def test_states_within_the_tolerance_stay_as_they_are() -> None:
+    mechanism, run, _ = driven("four_bar", ["crank"])
+    found = srm.inverse_dynamics(mechanism, run, "crank")
+    assert not found.moved.any()
+    motion = run.t, run.q, run.v, run.accelerations
+    np.testing.assert_array_equal(
+        found.torques, srm.inverse_dynamics(mechanism, motion, "crank").torques
+    )
+
+
+def test_the_states_of_a_run_with_actions_are_moved_in_each_segment() -> None:
+    """An event halves the rates of a run, without a torque before and after it."""
+    mechanism, half = load("four_bar"), 0.6
+    slower = srm.Event(lambda t, q, v: t - half, action=lambda t, q, v: (q, 0.5 * v))
+    run = srm.simulate(mechanism, 2.0 * half, rtol=1e-2, events=[slower])
+    run = run.at(np.linspace(0.0, 2.0 * half, 40))
+    found = srm.inverse_dynamics(mechanism, run)
+    for part in (run.t < half, run.t > half):
+        assert (found.moved[part] > 0.0).any()
+    np.testing.assert_allclose(found.torques, 0.0, atol=1e-12)
+
+
+def test_a_run_of_a_mechanism_with_other_closures_stays_refused() -> None:
+    mechanism = load("four_bar")
+    run = srm.simulate(load("slider_crank_regular"), 0.2, rtol=1e-3)
+    with pytest.raises(srm.InputError, match="another mechanism"):
+        srm.inverse_dynamics(mechanism, run)
+    (pin_closure,) = mechanism.loops
+    longer = replace(
+        mechanism, loops=(replace(pin_closure, b=srm.Anchor("world", xyz=(2.1, 0.0, 0.0))),)
+    )
+    run = srm.simulate(mechanism, 0.2, rtol=1e-3)
+    with pytest.raises(srm.InputError, match="positions of the motion violate the closures"):
+        srm.inverse_dynamics(longer, run)
+
+
+@pytest.mark.parametrize("size", [1e155, 1e200, 1e300])
+def test_rates_whose_accelerations_overflow_are_refused(size: float) -> None:
+    mechanism = load("four_bar")
+    v = size * srm.assemble(mechanism, mechanism.q0, {"crank": 1.0}).v
+    for motion in (([0.0], [mechanism.q0], [v], [v]), ([0.0], [mechanism.q0], [v], [0.0 * v])):
+        with pytest.raises(srm.InputError, match="so fast that its accelerations overflow"):
+            srm.inverse_dynamics(mechanism, motion)
 
 
 def test_inverse_dynamics_are_shown_in_one_line() -> None:

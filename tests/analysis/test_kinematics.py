@@ -156,3 +156,16 @@ def test_the_command_line_writes_the_page_and_says_what_it_passes(tmp_path: Path
     assert "crank = 1.57079633 rad, loops pin" in said
     said = run("linkage", "four_bar", "--crank", "crank", "--trace", "coupler:1,0,0", status=2)
     assert "--trace: it is drawn in the page" in said
+
+
+@pytest.mark.parametrize("analysis", [srm.kinematics, srm.linkage_report])
+def test_a_joint_that_no_motion_moves_is_no_crank(analysis) -> None:
+    """A body on the rocker of a four-bar whose hinge a second closure locks."""
+    four_bar = load("four_bar")
+    model = four_bar.model.copy()
+    rocker = model.getJointId("rocker")
+    add_link(model, rocker, pin.JointModelRY(), "stuck")
+    lock = srm.LoopClosure("frame", srm.Anchor("stuck"), srm.Anchor("rocker"), name="lock")
+    mechanism = srm.Mechanism(model, (*four_bar.loops, lock), q0=[*four_bar.q0, 0.0])
+    with pytest.raises(srm.InputError, match="no motion of the mechanism moves the joint 'stuck'"):
+        analysis(mechanism, "stuck")

@@ -12,9 +12,10 @@ from scipy.optimize import fsolve
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import closure_errors
+from tests.support.backends import on_both
 from tests.support.bundled import load
 from tests.support.mechanisms import along_x, rod
-from tests.support.reduced import G, index_one, n_four_bar, regular_slider_crank
+from tests.support.reduced import G, index_one, n_four_bar, regular_slider_crank, slider_crank
 
 DERIVATIVE = ((1, 0.75), (2, -0.15), (3, 1.0 / 60.0))
 
@@ -186,7 +187,9 @@ def test_mode_shapes_are_closed_motions_that_can_be_played(tmp_path: Path) -> No
 
 def test_inconsistent_rates_are_refused() -> None:
     mechanism = load("four_bar")
-    with pytest.raises(srm.InputError, match=r"not consistent: .*, rate 7.6e-01"):
+    with pytest.raises(
+        srm.InputError, match=r"^v: the state violates the closures: row pin\.[xz] by"
+    ):
         srm.linearise(mechanism, mechanism.q0, [1.0, 0.0, 0.0])
 
 
@@ -200,3 +203,56 @@ def test_a_linearisation_is_one_line_and_its_matrices_are_printed() -> None:
     for matrix in (found.A, found.B, found.drift, found.eigenvalues):
         assert str(matrix) in printed
     assert "object at" not in printed
+
+
+@on_both
+def test_states_of_a_loose_run_are_linearised_on_the_closures(backend: str) -> None:
+    """They are moved as the start of a run is; the derivatives are those of the reduced model at
+    the state that the result names."""
+    mechanism = load("four_bar")
+    run = srm.simulate(mechanism, 2.0, rtol=1e-3, backend=backend)
+    t = np.array([0.65, 1.05, 1.1, 1.75, 1.85])
+    assert run.at(t).drift.max(axis=1).min() > 1e-4
+    for time in t:
+        q, v = run(time)
+        found = srm.linearise(mechanism, q, v, coordinates="crank", rtol=1e-3)
+        assert 0.0 < found.moved < 10.0
+        assert f"{found.moved:.2g}" in str(found)
+        start = srm.simulate(mechanism, 1e-3, q0=q, v0=v, rtol=1e-3, backend=backend)
+        np.testing.assert_allclose(found.q, start.q[0], atol=1e-13)
+        np.testing.assert_allclose(found.v, start.v[0], atol=1e-12)
+        exact = jacobian(reduced_four_bar(found.mechanism), np.array([found.q[0], found.v[0]]))
+        np.testing.assert_allclose(found.A, exact, rtol=1e-7, atol=1e-7)
+
+
+def test_states_farther_from_the_closures_than_their_run_allows_are_refused() -> None:
+    mechanism = load("four_bar")
+    q, v = srm.simulate(mechanism, 2.0, rtol=1e-3)(1.85)
+    with pytest.raises(
+        srm.InputError, match=r"row pin.*or give the rtol of the run that the state"
+    ):
+        srm.linearise(mechanism, q, v)
+    with pytest.raises(srm.InputError, match=r"the state violates the closures: row pin"):
+        srm.linearise(mechanism, q + 0.05, v, rtol=1e-3)
+
+
+def test_states_on_the_closures_stay_as_they_are() -> None:
+    mechanism = load("four_bar")
+    found = srm.linearise(mechanism)
+    assert found.moved == 0.0
+    assert "moved" not in str(found)
+    np.testing.assert_array_equal(found.q, mechanism.q0)
+
+
+@pytest.mark.parametrize("distance", [1e-2, 1e-3, 1e-4, 1e-5])
+def test_beside_a_singular_configuration_the_state_is_not_moved_by_rounding(
+    distance: float,
+) -> None:
+    """A Newton step on closures that are open by rounding moves the state by that over sigma."""
+    mechanism, reduced = load("slider_crank"), slider_crank()
+    state = np.array([0.5 * np.pi - distance, 1.3])
+    found = srm.linearise(
+        mechanism, state[0] * np.array([1, -2]), state[1] * np.array([1, -2]), coordinates="crank"
+    )
+    np.testing.assert_allclose(found.drift, reduced(0.0, state), rtol=1e-6)
+    np.testing.assert_allclose(found.A, jacobian(reduced, state), atol=1e-8)

@@ -216,3 +216,41 @@ def test_a_report_is_shown_in_one_line_and_printed_as_a_table() -> None:
     )
     assert str(report).startswith("crank ")
     assert "time ratio" in str(report)
+
+
+@pytest.mark.parametrize(
+    ("name", "crank"), [("klann_walker", "hip_r"), ("bricard", "hinge_5"), ("wiper", "L")]
+)
+def test_strokes_between_dead_points_are_those_of_a_path_in_small_steps(
+    name: str, crank: str
+) -> None:
+    """A limit may lie on one of the positions of the report, where the rate is rounding of either
+    sign."""
+    mechanism = load(name)
+    report = srm.linkage_report(mechanism, crank)
+    start = mechanism.q0[mechanism.joint(crank).idx_q]
+    low, high = report.dead_points
+    ways = [
+        srm.follow(mechanism, {crank: np.linspace(start, end, 300)}).q
+        for end in (low + 1e-7, high - 1e-7)
+    ]
+    q = np.concatenate([ways[0][::-1], ways[1]])
+    for joint, stroke in report.strokes.items():
+        sampled = q[:, mechanism.joint(joint).idx_q]
+        step = np.abs(np.diff(sampled)).max()
+        assert sampled.max() - 1e-9 <= stroke.upper <= sampled.max() + step
+        assert sampled.min() - step <= stroke.lower <= sampled.min() + 1e-9
+        moves = np.diff(sampled)[np.abs(np.diff(sampled)) > 1e-9]
+        assert len(stroke.limits) == np.sum(moves[:-1] * moves[1:] < 0.0)
+
+
+def test_a_joint_may_turn_back_between_the_last_position_and_a_dead_point() -> None:
+    """The crank's positions are a degree apart, and its last way to a dead point is shorter."""
+    mechanism = load("jansen_walker")
+    stroke = srm.linkage_report(mechanism, "left_1_hip").strokes["right_0_c"]
+    curve = srm.kinematics(mechanism, "left_1_hip")
+    sampled = curve.q[:, mechanism.joint("right_0_c").idx_q]
+    near = np.abs(curve.positions - stroke.crank_at_upper) < 0.01
+    assert len(stroke.limits) == 2
+    np.testing.assert_allclose(stroke.upper, sampled[near].max(), atol=5e-6)
+    assert stroke.upper >= sampled[near].max()

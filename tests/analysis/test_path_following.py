@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import srm_mbs as srm
 from srm_mbs.dynamics.constraints.rows import closure_errors
+from tests.support.mechanisms import add_link
 
 
 def gaps(path: srm.FollowedPath) -> float:
@@ -107,3 +109,23 @@ def test_a_path_and_its_motion_are_shown_in_one_line_each() -> None:
     assert repr(path.motion(2.0)) == (
         f"JointMotion('four_bar', t=0..2 s, {len(path.path)} configurations)"
     )
+
+
+def test_a_path_that_leads_to_infinity_ends() -> None:
+    """A slide on a wall, which a straight guide on a hinge pushes: its place is cot(angle), and as
+    the angle falls to zero the path leads to infinity."""
+    model = pin.Model()
+    body = pin.Inertia.FromSphere(1.0, 0.1)
+    for name, joint in (("guide", pin.JointModelRY()), ("slide", pin.JointModelPX())):
+        place = pin.SE3(np.eye(3), np.array([0.0, 0.0, 1.0 if name == "guide" else 0.0]))
+        add_link(model, 0, joint, name, body, place)
+    line = srm.LoopClosure(
+        "point_on_line", srm.Anchor("slide"), srm.Anchor("guide"), axis=(1.0, 0.0, 0.0), name="line"
+    )
+    mechanism = srm.Mechanism(model, (line,), q0=[0.25 * np.pi, 1.0])
+    path = srm.follow(mechanism, {"guide": [0.0]})
+    assert not path.complete
+    assert "cannot be followed beyond" in path.message
+    assert len(path.q) == 0
+    assert path.limit.values["guide"] < 0.02
+    np.testing.assert_allclose(path.path[:, 1] * np.tan(path.path[:, 0]), 1.0, atol=1e-9)

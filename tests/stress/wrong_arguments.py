@@ -182,7 +182,10 @@ def calls(folder: Path) -> dict[str, Call]:
         "linearise": Call(
             srm.linearise,
             (four_bar, q, v),
-            {"inputs": None, "coordinates": None, "step": 0.003, "controller": None},
+            {
+                **{"inputs": None, "coordinates": None, "step": 0.003, "controller": None},
+                **{"rtol": 1e-6},
+            },
         ),
         "follow": Call(srm.follow, (four_bar, {crank: float(q[0]) + 0.01}), {"q": None}),
         "inverse_dynamics": Call(

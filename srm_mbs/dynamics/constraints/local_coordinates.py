@@ -26,6 +26,9 @@ from srm_mbs.model.lazy import cached_property
 
 CONSTRAINT_TOLERANCE = 1e-12
 """Largest closure error of a point of the chart, in row units."""
+ROUNDING = 1e-15
+"""Closure error, in row units, that a further step would not make smaller: next to a singular
+configuration it would move the point by that over the smallest singular value."""
 RANK_TOLERANCE = 1e-10
 """Singular value, over the usual norm of G, below which a direction does not move the closures."""
 ITERATIONS = 20
@@ -144,7 +147,7 @@ class TangentChart:
 
             return float(np.abs(g).max(initial=0.0)), step
 
-        u, error = newton(self.basis @ z, linearise, ITERATIONS)
+        u, error = newton(self.basis @ z, linearise, ITERATIONS, tolerance=ROUNDING)
         return (
             ChartPoint(self, geometry.move(self.q, u), u) if error <= CONSTRAINT_TOLERANCE else None
         )

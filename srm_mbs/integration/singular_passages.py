@@ -1128,9 +1128,12 @@ def _crossings_at(
         if not _vanishes_once(times[near], values[near], lowest, scale):
             lowest = None
     if lowest is None:
-        # The widest has the samples of the others.
-        for width in DIP_WIDTHS if minima else DIP_WIDTHS[-1:]:
-            times = _times_around(t, first, k, last, width, SAMPLES_PER_INTERVAL)
+        # The widest has the samples of the others.  Stages are less accurate than dense output,
+        # whose minimum may lie beyond the sides that they show.
+        widest = DIP_WIDTHS[-1]
+        windows = [(first, last, width) for width in (DIP_WIDTHS if minima else (widest,))]
+        for left, right, width in (*windows, (free.start, free.stop - 1, widest)):
+            times = _times_around(t, left, k, right, width, SAMPLES_PER_INTERVAL)
             values = yield times
             minima = _minima(values, max(scale, float(values.max())))
             if minima:

@@ -303,24 +303,27 @@ def _refusal(
     more of it."""
     rows = mechanism.structure.row_names
     kind = "drives" if found.row >= len(rows) - len(mechanism.drives) else "closures"
-    q, v = names
-    at = f", {t!r}" if t else ""
-    projected = f"srm.Simulator(mechanism).reset({q}, {v}{at}, project=True)"
-    if remedy:
-        pass
-    elif near_singular:
-        remedy = (
-            f"Start at another time of the motion, or on the branch of {v}: {projected} returns it"
-        )
-    elif mechanism.drives and t:  # where drives lead to by then, assembly does not know
-        remedy = f"Use {projected}, which returns a consistent q and v"
-    else:
-        remedy = "Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v"
     return InputError(
         f"{what} violates the {kind}: row {rows[found.row]} by {found.value:.1e}{also}",
         element=names[found.rate],
-        remedy=remedy,
+        remedy=remedy or _way_to_a_start(mechanism, t, names, near_singular),
     )
+
+
+def _way_to_a_start(
+    mechanism: Mechanism, t: float, names: tuple[str, str], near_singular: bool
+) -> str:
+    """The remedy for the start of a run at ``t`` (s) that is refused."""
+    q, v = names
+    at = f", {t!r}" if t else ""
+    projected = f"srm.Simulator(mechanism).reset({q}, {v}{at}, project=True)"
+    if near_singular:
+        return (
+            f"Start at another time of the motion, or on the branch of {v}: {projected} returns it"
+        )
+    if mechanism.drives and t:  # where drives lead to by then, assembly does not know
+        return f"Use {projected}, which returns a consistent q and v"
+    return "Use srm.assemble(mechanism, q=..., v=...) to get a consistent q and v"
 
 
 def closed_end(

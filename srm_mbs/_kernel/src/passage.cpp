@@ -118,8 +118,8 @@ public:
         const double distance = norm(away.data(), n_);
         double nearest = 0.0;
         if (rates) {
-            // On each level of the residual beta and the other coordinate grow at rates in the ratio
-            // in which they are, but for the curvatures: the rates know the branch at q*, too.
+            // Along each hyperbola d kept / d beta has the sign of kept / beta, and at q* it is the
+            // slope of a branch: the rates tell the branch, also where the place does not.
             const double ahead = dot(along.data(), rates->data(), n_);
             if (ahead == 0.0) throw NoPassage{};
             const double rise = dot(kept_.data(), rates->data(), n_) / ahead;

@@ -385,8 +385,8 @@ class CurveThroughSaddle:
         self._sign = float(np.sign(beside if not exact else beside * self.beta))
         distance, nearest = float(np.linalg.norm(away)), 0.0
         if rates is not None:
-            # On each level of the residual beta and the other coordinate grow at rates in the ratio
-            # in which they are, but for the curvatures: the rates know the branch at q*, too.
+            # Along each hyperbola d kept / d beta has the sign of kept / beta, and at q* it is the
+            # slope of a branch: the rates tell the branch, also where the place does not.
             ahead, aside = float(self.along @ rates), float(self._kept @ rates)
             if ahead == 0.0:
                 raise ValueError("the rates lead nowhere")
